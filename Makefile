@@ -1,0 +1,50 @@
+# `make demo` and `make test` do all their own set-up in .venv; nothing but Python 3.10+ and make is needed. `make help` lists the verbs.
+PYTHON ?= python3
+PIP := .venv/bin/python -m pip --disable-pip-version-check
+BIN := .venv/bin
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint types docs bench clean
+
+help: ## list the verbs
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+setup: .venv/dev.stamp ## make .venv with pcdenoise and everything a developer needs
+
+demo: .venv/run.stamp ## clean the shipped scan with the shipped model and show before and after, in demo/
+	@mkdir -p demo
+	$(BIN)/pcdenoise denoise examples/milk.pcd -o demo/milk_clean.pcd --overwrite \
+		--picture demo/before_after.png --report demo/report.html
+
+test: .venv/dev.stamp ## all tests
+	$(BIN)/python -m pytest
+
+lint: .venv/dev.stamp ## ruff (style and bugs) and import-linter (the layers)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+
+types: .venv/dev.stamp ## mypy --strict
+	$(BIN)/mypy
+
+docs: .venv/dev.stamp ## run every command of README and docs/, and rebuild the command reference
+	$(BIN)/python docs/reference.py
+	$(BIN)/python -m pytest tests/test_docs.py
+
+bench: .venv/run.stamp ## the shipped model against a shape with known truth
+	$(BIN)/pcdenoise synth shapes:2 -o demo/bench --points 10000 --levels 0.5,1,1.5 --seed 1 --overwrite
+
+clean: ## remove .venv and what demo and bench wrote
+	rm -rf .venv demo build
+
+# A stamp is as new as the last set-up; pip runs again when the dependencies change.
+.venv/bin/python:
+	$(PYTHON) -m venv .venv
+
+.venv/run.stamp: .venv/bin/python pyproject.toml constraints.txt
+	$(PIP) install -q -c constraints.txt -e .
+	@touch $@
+
+.venv/dev.stamp: .venv/bin/python pyproject.toml constraints.txt
+	$(PIP) install -q -c constraints.txt -e '.[dev]'
+	@touch $@ .venv/run.stamp

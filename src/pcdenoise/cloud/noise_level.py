@@ -1,0 +1,104 @@
+"""How noisy a cloud is and at what scale its surface shows. Not here: what is done about it (denoising)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcdenoise.cloud.neighbours import Indices, NeighbourSearch, distinct, spatial_order
+from pcdenoise.cloud.scan import Points
+
+N_PROBES = 1000
+"""Points whose surroundings are looked at; the estimate's own scatter is then two to three percent."""
+
+_PROBED = 128_000  # neighbours looked at on one rung of the ladder
+_LADDER = (16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 1536, 2048)
+_SURFACE_ASPECT = 3.8
+"""A neighbourhood shows a surface once its radius is so many times what a quadric leaves in it.
+
+A ball that is filled with noise has 2.3 to 2.9 at any size, a disc of radius R under noise std has R / std.
+"""
+_CLEARER_SHARE = 0.3  # this share of all places must show it: edges and thin parts stay thick at any scale
+_SCALE_STDS = 4.5  # the radius of the neighbourhood of `scale_points`
+
+@dataclass(frozen=True)
+class NoiseLevel:
+    """std: noise along the normal; spacing: median distance to the nearest other point (both in the points' unit).
+
+    scale_points: how many nearest points show a surface rather than a ball of noise; it grows as std² times density.
+    is_surface: whether any scale shows one (False: vegetation, clutter, a filled volume).
+    """
+
+    std: float
+    spacing: float
+    scale_points: float
+    is_surface: bool
+
+
+def estimate(points: Points, seed: int = 0, threads: int = -1) -> NoiseLevel:
+    """The noise level of (N, 3) finite points from a fixed number of probes, at a cost that hardly grows with N.
+
+    Neighbourhoods grow until a share of all places shows a surface; the noise is what a quadric height field leaves there,
+    its six degrees of freedom given back. Exact duplicates count once. Fewer than 16 distinct points give std 0 and no surface.
+    """
+    points = points[distinct(points)[0]]
+    points = points[spatial_order(points)]
+    if len(points) < _LADDER[0]:
+        return NoiseLevel(0.0, 0.0, float(_LADDER[0]), False)
+    rng = np.random.default_rng(seed)
+    probes = points[np.sort(rng.choice(len(points), size=min(N_PROBES, len(points)), replace=False))]
+    search = NeighbourSearch(points, threads)
+    spacing = float(np.median(search.knn(probes, 2)[0][:, 1]))
+
+    rungs: list[_Rung] = []
+    for k in (k for k in _LADDER if k <= len(points)):
+        some = probes[:: max(1, N_PROBES * k // _PROBED)]
+        distances, indices = search.knn(some, k)
+        radius = np.maximum(distances[:, -1], 1e-300)
+        aspect = 1 / np.maximum(_quadric_residual(points, some, radius, indices), 1e-6)
+        clear = float(np.quantile(aspect, 1 - _CLEARER_SHARE))
+        std = float(np.median((radius / aspect)[aspect >= np.quantile(aspect, 0.5)]))
+        rungs.append(_Rung(k, float(np.median(radius)), clear, std / _share_seen(clear)))
+        if clear >= _SURFACE_ASPECT and rungs[-1].radius >= _SCALE_STDS * rungs[-1].std:
+            break
+    shown = [rung for rung in rungs if rung.aspect >= _SURFACE_ASPECT]
+    if not shown:
+        return NoiseLevel(max(rungs, key=lambda rung: rung.aspect).std, spacing, float(_LADDER[0]), False)
+    std = shown[0].std
+    return NoiseLevel(std, spacing, _points_within(_SCALE_STDS * std, rungs), True)
+
+
+def _points_within(radius: float, rungs: list[_Rung]) -> float:
+    """How many points so large a ball holds; below the first rung their number grows as the radius squared."""
+    if radius <= rungs[0].radius:
+        return max(1.0, rungs[0].k * (radius / rungs[0].radius) ** 2)
+    return float(np.exp(np.interp(np.log(radius), [np.log(r.radius) for r in rungs], [np.log(r.k) for r in rungs])))
+
+
+@dataclass(frozen=True)
+class _Rung:
+    k: int
+    radius: float
+    aspect: float
+    std: float
+
+
+def _share_seen(aspect: float) -> float:
+    """How much of the noise a neighbourhood holds: the ball around a noisy point cuts its tails (measured on noisy planes)."""
+    return float(np.interp(aspect, [3.0, 3.7, 4.1, 4.7, 5.2, 6.1, 8.0], [0.72, 0.82, 0.86, 0.9, 0.92, 0.94, 0.95]))
+
+
+def _quadric_residual(points: Points, centres: Points, radius: NDArray[np.float64], indices: Indices) -> NDArray[np.float64]:
+    """(M,) standard deviation that a quadric over the PCA plane leaves in each neighbourhood, as a share of its radius."""
+    near = (points[indices] - centres[:, None]) / radius[:, None, None]
+    near -= near.mean(axis=1, keepdims=True)
+    frames = np.linalg.eigh(near.transpose(0, 2, 1) @ near)[1]
+    height, u, v = np.moveaxis(near @ frames, 2, 0)
+    design = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+    transposed = design.transpose(0, 2, 1)
+    coefficients = np.linalg.solve(transposed @ design + 1e-9 * np.eye(6), transposed @ height[:, :, None])
+    left = height - (design @ coefficients)[:, :, 0]
+    residual: NDArray[np.float64] = np.sqrt((left**2).sum(axis=1) / (near.shape[1] - 6))
+    return residual

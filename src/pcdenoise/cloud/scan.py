@@ -1,0 +1,86 @@
+"""A scan in memory and the local frame it is worked on in. Not here: files (io), neighbours (neighbours.py)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcdenoise.errors import ScanError
+
+Points = NDArray[np.float64]
+"""(N, 3) world coordinates."""
+LocalPoints = NDArray[np.float32]
+"""(N, 3) coordinates in a Frame."""
+Mask = NDArray[np.bool_]
+"""(N,) per-point truth values."""
+
+
+@dataclass(frozen=True)
+class Scan:
+    """N points in file order and all that the file said about them.
+
+    points      (N, 3) float64, file units; rows may be NaN or infinite (organised clouds): see `finite`.
+    attributes  name -> (N,) array in the file's own dtype, everything per point except x, y, z.
+    format      'las', 'laz', 'ply', 'xyz' or 'pcd'.
+    origin      where it was read from, for messages.
+    source      what the format's own module needs to write the file back as it was; opaque to everyone else.
+    added       names of attributes that were not in the file (displacement, outlier flag, …).
+    """
+
+    points: Points
+    attributes: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    format: str = "xyz"
+    origin: str = "<memory>"
+    source: Any = None
+    added: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype != np.float64:
+            raise ScanError(f"{self.origin}: points must be (N, 3) float64, got {self.points.shape} {self.points.dtype}")
+        for name, values in self.attributes.items():
+            if len(values) != len(self.points):
+                raise ScanError(f"{self.origin}: attribute {name} has {len(values)} rows, the scan has {len(self.points)}")
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def finite(self) -> Mask:
+        """(N,) rows whose three coordinates are numbers."""
+        finite: Mask = np.isfinite(self.points).all(axis=1)
+        return finite
+
+    def moved_to(self, points: Points) -> Scan:
+        """The same rows at other places: same N, same order, same attributes. Raises ScanError on another shape."""
+        if points.shape != self.points.shape:
+            raise ScanError(f"{self.origin}: {len(self.points)} points went in, {len(points)} came out; rows must stay rows")
+        return replace(self, points=np.ascontiguousarray(points, dtype=np.float64))
+
+    def with_attributes(self, **values: NDArray[Any]) -> Scan:
+        """The scan with new per-point columns, written as LAS extra bytes, PLY properties, text columns or PCD fields."""
+        added = self.added + tuple(name for name in values if name not in self.added)
+        return replace(self, attributes={**self.attributes, **values}, added=added)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A shift and a scale between world (float64) and local (float32) coordinates: local = (world - origin) / unit.
+
+    One float32 step at UTM northings is half a metre; relative to a nearby origin it is below a thousandth of any scanner's noise.
+    """
+
+    origin: NDArray[np.float64]
+    unit: float = 1.0
+
+    def to_local(self, points: Points) -> LocalPoints:
+        """(N, 3) world to (N, 3) local."""
+        return ((points - self.origin) / self.unit).astype(np.float32)
+
+    def to_world(self, points: LocalPoints) -> Points:
+        """(N, 3) local to (N, 3) world."""
+        world: Points = points.astype(np.float64) * self.unit + self.origin
+        return world

@@ -1,0 +1,205 @@
+"""`pcdenoise denoise`: scans in, clean scans out."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pcdenoise.commands import options, outputs
+from pcdenoise.commands.batch import Batch, Figures
+from pcdenoise.commands.console import Console, figure, table
+from pcdenoise.commands.files import Job, expand, format_of, plan, refuse_existing
+from pcdenoise.commands.options import configured, option
+from pcdenoise.commands.undo import with_displacement
+from pcdenoise.errors import UsageError
+
+if TYPE_CHECKING:
+    from pcdenoise.cloud.scan import Scan
+    from pcdenoise.config import DenoiseConfig
+    from pcdenoise.denoising.denoiser import Result
+    from pcdenoise.evaluation.report import Page
+    from pcdenoise.networks.store import Model
+
+
+Method = Annotated[
+    Literal["network", "mean", "bilateral", "jet"], option("--method", help="The learned model or a classical filter.")
+]
+Iters = Annotated[str, option("--iters", metavar="N|auto", help="Passes; auto stops when the next would not help.")]
+
+
+def denoise(
+    inputs: options.Inputs,
+    output: options.Output = "",
+    model: options.Model = None,
+    method: Method = "network",
+    iters: Iters = "1",
+    strength: Annotated[float, option("--strength", help="Share of the move that is made, 0 to 1.")] = 1.0,
+    max_move: Annotated[float | None, option("--max-move", help="Longest move of a point, in the file's unit.")] = None,
+    outliers: Annotated[
+        Literal["keep", "flag", "remove"], option("--outliers", help="Points far from any surface: keep, mark, or leave out.")
+    ] = "keep",
+    displacement: Annotated[
+        bool, option("--displacement", help="Store where each point was and how far it moved; undo needs it.")
+    ] = False,
+    format: options.Format = None,
+    suffix: Annotated[str, option("--suffix", help="Put between name and extension when the output is a folder.")] = "",
+    overwrite: options.Overwrite = False,
+    drop_attributes: Annotated[
+        bool, option("--drop-attributes", help="Allow a conversion to lose what the new format cannot hold.")
+    ] = False,
+    report: options.Report = None,
+    picture: options.Picture = None,
+    dry_run: Annotated[bool, option("--dry-run", help="Print what would be done and write nothing.")] = False,
+    config: options.Config = None,
+    seed: options.Seed = 0,
+    threads: options.Threads = None,
+    quiet: options.Quiet = False,
+    verbose: options.Verbose = False,
+) -> None:
+    """Move noisy points to the surface they were measured on.
+
+    Rows, their order and all attributes stay; where there is no surface (leaves, wires, clutter) points stay where they are.
+
+    Example: pcdenoise denoise scan.laz -o clean.laz --picture before_after.png
+    """
+    from pcdenoise.config import DenoiseConfig
+
+    settings = configured(
+        DenoiseConfig, method=method, iters=iters, strength=strength, max_move=max_move, outliers=outliers,
+        seed=seed, threads=threads,
+    )  # fmt: skip
+    console, sources = Console(quiet, verbose), expand(inputs)
+    if dry_run:
+        print(_plan_text(sources, output, suffix, format, settings))
+        return
+    if not output:
+        raise UsageError("-o is missing; say where the result goes: -o clean.las, -o folder/ or -o -")
+    jobs = plan(sources, output, suffix=suffix, format=format)
+    pictures = {job.source: job.target for job in plan(sources, str(picture), format="png")} if picture else {}
+    refuse_existing([*(job.target for job in jobs), *pictures.values(), report], overwrite)
+    cleaning = _Cleaning(
+        settings, chosen_model(model, settings), console, format, overwrite, drop_attributes, displacement, pictures
+    )
+    batch = Batch(console)
+    batch.run(jobs, cleaning.clean)
+    if report:
+        page = cleaning.pages[0] if len(jobs) == len(cleaning.pages) == 1 else None
+        outputs.save_report(report, "denoise", cleaning.settings, batch.records, page, overwrite=overwrite)
+    batch.close()
+
+
+def chosen_model(name: str | None, settings: DenoiseConfig) -> Model | None:
+    """The network to use, or None for a classical filter."""
+    if settings.method != "network":
+        if name is not None:
+            raise UsageError(f"--model {name}: --method {settings.method} uses no model; leave one of the two out")
+        return None
+    from pcdenoise.networks import store
+
+    return store.load(name) if name else store.load()
+
+
+@dataclass(frozen=True)
+class _Cleaning:
+    """What is the same for every scan of a run: how to clean, what to write, and pages of the last scan for its report."""
+
+    config: DenoiseConfig
+    model: Model | None
+    console: Console
+    format: str | None
+    overwrite: bool
+    drop_attributes: bool
+    displacement: bool
+    pictures: dict[Path, Path]
+    pages: list[Page] = field(default_factory=list)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Everything that shaped the result, by name, for the report and the file's provenance."""
+        named = {"model": self.model.name, "model_sha256": self.model.sha256} if self.model else {}
+        return {**self.config.model_dump(mode="json"), **named}
+
+    def clean(self, job: Job) -> Figures:
+        """Reads one scan, cleans it, writes it with its picture, and returns its figures."""
+        from pcdenoise import io
+        from pcdenoise.commands.info import coordinate_step
+        from pcdenoise.denoising import denoiser
+        from pcdenoise.evaluation.report import Page
+
+        started = time.perf_counter()
+        self.console.detail(f"{job.source}: reading")
+        scan = io.read(job.source, format=format_of(job.source, self.format))
+        with self.console.progress(job.source.name) as on_progress:
+            result = denoiser.denoise(scan.points, self.model, self.config, on_progress)
+        job.target.parent.mkdir(parents=True, exist_ok=True)
+        io.write(
+            self._marked(scan, result), job.target, format=format_of(job.target, self.format), overwrite=self.overwrite,
+            drop_attributes=self.drop_attributes, provenance=outputs.provenance("denoise", self.settings),
+        )  # fmt: skip
+        figures = {"points": len(scan), **result.figures, "seconds": round(time.perf_counter() - started, 3)}
+        if picture := self.pictures.get(job.source):
+            outputs.save_before_after(picture, scan, result.points, notes=_notes(result), overwrite=self.overwrite)
+        self.pages[:] = [Page(scan.points, result.points, colours=outputs.colours(scan))]
+        step = coordinate_step(scan)
+        if step and 0 < figures["move_median"] < step / 2:
+            self.console.note(
+                f"{job.target}: most moves are below the file's step of {step:g} and vanish; write .ply to keep them"
+            )
+        self.console.note(f"{job.target}: {_summary(figures)}" + (f"; picture {picture}" if picture else ""))
+        return figures
+
+    def _marked(self, scan: Scan, result: Result) -> Scan:
+        """The moved scan with the columns that were asked for, without the rows that were not wanted."""
+        from pcdenoise import io
+
+        cleaned = scan.moved_to(result.points)
+        if self.displacement:
+            cleaned = with_displacement(scan.points, cleaned)
+        if self.config.outliers == "flag":
+            cleaned = cleaned.with_attributes(outlier=result.outlier.astype("u1"))
+        return io.select(cleaned, ~result.outlier) if self.config.outliers == "remove" else cleaned
+
+
+def _notes(result: Result) -> tuple[str, str]:
+    """The noise before the first pass and after the last, for a picture."""
+    if not result.steps:
+        return "", "nothing moved"
+    before, after = result.steps[0].figures["noise_before"], result.steps[-1].figures["noise_after"]
+    return f"noise {figure(before)}", f"noise {figure(after)}"
+
+
+def _summary(figures: Figures) -> str:
+    """One line for a person: how many points, how noisy they were, how far they moved, what was left alone."""
+    parts = [f"{figures['points']:,} points"]
+    parts.append(f"noise {figure(figures['noise'])}" if figures["is_surface"] else "no surface to clean")
+    parts.append(f"moved {figure(figures['move_median'])} (median), at most {figure(figures['move_max'])}")
+    if figures["points_left_alone"]:
+        parts.append(f"{figures['points_left_alone']:,} left alone")
+    if figures["outliers"]:
+        parts.append(f"{figures['outliers']:,} outliers")
+    return ", ".join([*parts, f"{figures['seconds']:.1f} s"])
+
+
+def _plan_text(sources: list[Path], output: str, suffix: str, format: str | None, settings: DenoiseConfig) -> str:
+    """What a run would do, input by input, after a look at each."""
+    from pcdenoise import io
+    from pcdenoise.commands.info import survey
+
+    jobs = plan(sources, output, suffix=suffix, format=format) if output else [Job(source, Path("?")) for source in sources]
+    rows = []
+    for job in jobs:
+        found = survey(io.read(job.source, format=format_of(job.source, format)), seed=settings.seed)
+        noise = figure(found["noise"]) if found.get("is_surface") else "no surface"
+        rows.append(
+            [
+                str(job.source),
+                f"{found['points']:,}",
+                figure(found.get("spacing", 0.0)),
+                noise,
+                str(settings.iters),
+                str(job.target),
+            ]
+        )
+    return table(["input", "points", "spacing", "noise", "passes", "output"], rows)

@@ -1,0 +1,99 @@
+"""Which files a command reads and where each result goes: folders, patterns, `-`, names. Not here: their content (io)."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pcdenoise.errors import ScanError, UsageError
+
+if TYPE_CHECKING:
+    from pcdenoise.cloud.scan import Scan
+
+STREAM = Path("-")
+"""Standard input or output."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One input and where its result goes."""
+
+    source: Path
+    target: Path
+
+
+def expand(inputs: Sequence[str]) -> list[Path]:
+    """Every scan that the arguments name, in order and once: files, `-`, the scans of a folder, patterns ('tiles/**/*.laz').
+
+    Raises ScanError for a file that is not there, a folder without scans or a pattern without a match.
+    """
+    found = [path for text in inputs for path in _expand_one(text)]
+    return list(dict.fromkeys(found))
+
+
+def _expand_one(text: str) -> list[Path]:
+    from pcdenoise import io
+
+    path = Path(text)
+    if text == "-" or path.is_file():
+        return [path]
+    if path.is_dir():
+        scans = sorted(entry for entry in path.iterdir() if entry.is_file() and io.is_scan(entry))
+        if not scans:
+            raise ScanError(f"{text}: the folder holds no scan; known suffixes are {' '.join(sorted(io.SUFFIXES))}")
+        return scans
+    if glob.has_magic(text):
+        matches = sorted(Path(match) for match in glob.glob(text, recursive=True) if Path(match).is_file())
+        if not matches:
+            raise ScanError(f"{text}: the pattern matches no file; quote it and check the folder")
+        return matches
+    if path.exists():  # a named pipe or a device
+        return [path]
+    raise ScanError(f"{text}: no such file or folder; check the path")
+
+
+def plan(sources: Sequence[Path], output: str, *, suffix: str = "", format: str | None = None) -> list[Job]:
+    """One target for each source: the output itself for one source, a file of the same name in the output folder for several.
+
+    suffix goes between name and extension; format, where given, sets the extension. Raises UsageError if two results would
+    meet in one file, or several in what is not a folder.
+    """
+    folder = output.endswith(("/", "\\")) or Path(output).is_dir()
+    if not folder:
+        if len(sources) > 1:
+            raise UsageError(f"-o {output}: {len(sources)} inputs need a folder; end the name with a slash: -o {output}/")
+        return [Job(sources[0], Path(output))]
+    jobs = [Job(source, Path(output) / _target_name(source, suffix, format)) for source in sources]
+    by_target: dict[Path, Path] = {}
+    for job in jobs:
+        other = by_target.setdefault(job.target, job.source)
+        if other != job.source:
+            raise UsageError(f"-o {output}: {other} and {job.source} would both become {job.target}; clean them into two folders")
+    return jobs
+
+
+def _target_name(source: Path, suffix: str, format: str | None) -> str:
+    stem, extension = ("stdin", "") if source == STREAM else (source.stem, source.suffix)
+    return f"{stem}{suffix}{'.' + format if format else extension}"
+
+
+def refuse_existing(targets: Sequence[Path | None], overwrite: bool) -> None:
+    """Raises ScanError before any work is done if a target exists and must not be replaced."""
+    for target in targets:
+        if target is not None and target != STREAM and target.exists() and not overwrite:
+            raise ScanError(f"{target}: the file exists; add --overwrite to replace it")
+
+
+def format_of(path: Path, format: str | None) -> str | None:
+    """The format to read or write a path as: what --format says for `-` and where the suffix says nothing, else None."""
+    from pcdenoise import io
+
+    return format if path == STREAM or not io.is_scan(path) else None
+
+
+def attachments(scan: Scan) -> list[str]:
+    """What a scan's file holds beside points and columns, in words: CRS, VLRs, faces, a viewpoint."""
+    return list(scan.source.attachments()) if scan.source is not None else []

@@ -1,0 +1,136 @@
+"""`pcdenoise iterate`: every pass of a denoising run, to look at. Not here: when to stop (denoising)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pcdenoise.commands import options, outputs
+from pcdenoise.commands.console import Console, figure, table
+from pcdenoise.commands.denoise import Iters, Method, chosen_model
+from pcdenoise.commands.files import format_of, refuse_existing
+from pcdenoise.commands.options import argument, configured, option
+
+if TYPE_CHECKING:
+    from pcdenoise.cloud.scan import Points, Scan
+    from pcdenoise.synthesis.meshes import Mesh
+
+
+def iterate(
+    source: Annotated[Path, argument(metavar="IN", help="The scan.")],
+    output: Annotated[Path, option("--output", "-o", metavar="DIR", help="The folder for every pass.")],
+    model: options.Model = None,
+    method: Method = "network",
+    iters: Iters = "5",
+    clean: Annotated[Path | None, option("--clean", metavar="FILE", help="Also show the error against this clean cloud.")] = None,
+    mesh: Annotated[Path | None, option("--mesh", metavar="FILE", help="Also show the error against this surface.")] = None,
+    format: options.Format = None,
+    overwrite: options.Overwrite = False,
+    config: options.Config = None,
+    seed: options.Seed = 0,
+    threads: options.Threads = None,
+    quiet: options.Quiet = False,
+) -> None:
+    """Write the scan after every pass, with a table, a strip of pictures (passes.png) and a page with a 3D viewer (report.html).
+
+    An error against a given truth is shown and never used to choose anything.
+
+    Example: pcdenoise iterate scan.laz -o steps/ --iters 5
+    """
+    from pcdenoise import io
+    from pcdenoise.config import DenoiseConfig
+    from pcdenoise.denoising import denoiser
+    from pcdenoise.synthesis.meshes import load_mesh
+
+    settings = configured(DenoiseConfig, method=method, iters=iters, seed=seed, threads=threads)
+    strip, report = output / "passes.png", output / "report.html"
+    refuse_existing([strip, report], overwrite)
+    scan = io.read(source, format=format_of(source, format))
+    truth = _Truth(_finite(io.read(clean)) if clean else None, load_mesh(mesh) if mesh else None)
+    weights = chosen_model(model, settings)
+    output.mkdir(parents=True, exist_ok=True)
+    passes = [_Pass(scan.points, truth.errors(scan.points))]
+    with Console(quiet).progress(source.name) as on_progress:
+        for number, step in enumerate(denoiser.iterate(scan.points, weights, settings), start=1):
+            on_progress(f"pass {number}", 0.0 if settings.iters == "auto" else number / settings.iters)
+            target = output / f"{source.stem}_{number}{source.suffix}"
+            io.write(scan.moved_to(step.points), target, format=format_of(target, format), overwrite=overwrite)
+            figures = {name: value for name, value in step.figures.items() if name != "iteration"}
+            passes.append(_Pass(step.points, {**figures, **truth.errors(step.points)}))
+    print(_as_text(passes))
+    _save_strip(strip, scan, passes, overwrite)
+    _save_report(report, scan, passes, settings.model_dump(mode="json"), overwrite)
+    Console(quiet).note(f"{output}: {len(passes) - 1} passes, {strip.name}, {report.name}")
+
+
+@dataclass(frozen=True)
+class _Pass:
+    """The points after a pass (the first entry: before any) and what is known about it."""
+
+    points: Points
+    figures: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Truth:
+    """What the user knows about the surface; for showing errors, never for choosing."""
+
+    clean: Points | None
+    mesh: Mesh | None
+
+    def errors(self, points: Points) -> dict[str, float]:
+        """The metrics of (N, 3) points that the truth allows, none without a truth."""
+        import numpy as np
+
+        from pcdenoise.evaluation.chamfer import evaluate
+
+        if self.clean is None and self.mesh is None:
+            return {}
+        return evaluate(points[np.isfinite(points).all(axis=1)], self.clean, self.mesh)
+
+
+def _finite(scan: Scan) -> Points:
+    return scan.points[scan.finite]
+
+
+def _as_text(passes: list[_Pass]) -> str:
+    names = list(dict.fromkeys(name for entry in passes for name in entry.figures))
+    rows = [[str(number), *(_cell(entry.figures.get(name)) for name in names)] for number, entry in enumerate(passes)]
+    return table(["pass", *(name.replace("_", " ") for name in names)], rows)
+
+
+def _cell(value: Any) -> str:
+    return figure(value) if isinstance(value, float) else "" if value is None else str(value)
+
+
+def _save_strip(path: Path, scan: Scan, passes: list[_Pass], overwrite: bool) -> None:
+    from pcdenoise.evaluation.framing import camera_for
+    from pcdenoise.evaluation.pictures import render, strip, write_png
+
+    size = (480, 360)
+    camera, colour = camera_for(_finite(scan), size), outputs.rgb(scan)
+    images = [render(entry.points, colour=colour, view=camera, size=size) for entry in passes]
+    write_png(path, strip(images, ["Before", *(f"Pass {number}" for number in range(1, len(passes)))]), overwrite=overwrite)
+
+
+def _save_report(path: Path, scan: Scan, passes: list[_Pass], settings: dict[str, Any], overwrite: bool) -> None:
+    from pcdenoise.evaluation.charts import curve
+    from pcdenoise.evaluation.report import Page
+
+    last = passes[-1]
+    numbers = range(len(passes))
+    names = [name for name, value in last.figures.items() if isinstance(value, float)]
+    charts = [
+        curve(
+            {name: [entry.figures.get(name, float("nan")) for entry in passes]},
+            title=name.replace("_", " ").capitalize(),
+            x_label="Pass",
+        )
+        for name in names
+    ]
+    steps = {f"Pass {number}": passes[number].points for number in numbers[1:-1]}
+    rows = [{"pass": number, **passes[number].figures} for number in numbers]
+    page = Page(scan.points, last.points, steps=steps, colours=outputs.colours(scan), charts=charts, tables={"Passes": rows})
+    files = [{"input": scan.origin, "status": "done", "figures": {"passes": len(passes) - 1, **last.figures}}]
+    outputs.save_report(path, "iterate", settings, files, page, overwrite=overwrite)

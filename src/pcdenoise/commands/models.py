@@ -1,0 +1,43 @@
+"""`pcdenoise models`: what models there are and what they are for."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pcdenoise.commands import options
+from pcdenoise.commands.console import table
+
+if TYPE_CHECKING:
+    from pcdenoise.networks.store import ModelInfo
+
+
+def models(
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Print this model's card.", show_default=False)] = None,
+    as_json: options.Json = False,
+    config: options.Config = None,
+) -> None:
+    """List the models that ship, or print one's card: training data, noise, scores, licence."""
+    from pcdenoise.networks import store
+
+    found = list(store.available())
+    if name is not None:
+        chosen = next((model for model in found if model.name == name), None) or store.info(Path(name))
+        print((chosen.path / store.CARD).read_text(encoding="utf-8").strip())
+    elif as_json:
+        print(json.dumps([_as_json(model) for model in found], indent=2))
+    else:
+        rows = [[model.name, f"{model.n_parameters:,}", model.config.network, model.config.summary] for model in found]
+        print(table(["model", "parameters", "network", "what"], rows, left={0, 2, 3}))
+
+
+def _as_json(model: ModelInfo) -> dict[str, Any]:
+    return {
+        "name": model.name,
+        "path": str(model.path),
+        "n_parameters": model.n_parameters,
+        **model.config.model_dump(mode="json"),
+    }

@@ -1,0 +1,121 @@
+"""Options that commands share, and where values come from: flag, environment, --config file, default, in this order."""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+
+import typer
+
+from pcdenoise.errors import UsageError
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    ConfigModel = TypeVar("ConfigModel", bound=BaseModel)
+
+ENVIRONMENT_PREFIX = "PCDENOISE"
+"""--max-move is also PCDENOISE_MAX_MOVE."""
+
+option = partial(typer.Option, show_envvar=False)
+common = partial(option, rich_help_panel="Common")
+argument = partial(typer.Argument, show_envvar=False)
+
+
+def _apply_config(context: typer.Context, path: Path | None) -> Path | None:
+    """Makes the file's values the defaults of the options that are read after it."""
+    if path is not None:
+        context.default_map = _defaults_from(path, context)
+    return path
+
+
+def _defaults_from(path: Path, context: typer.Context) -> dict[str, Any]:
+    """The settings of a TOML file for one command. Top-level keys hold for every command, tables for the command they name."""
+    if sys.version_info >= (3, 11):
+        import tomllib
+    else:
+        import tomli as tomllib
+
+    try:
+        settings = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{path}: not a readable TOML file ({_one_line(error)})") from None
+    assert context.parent is not None
+    group = context.parent.command
+    commands: dict[str, Any] = getattr(group, "commands", {})
+    options = {name: {parameter.name for parameter in command.params} - {"config"} for name, command in commands.items()}
+    everywhere = {_identifier(key): value for key, value in settings.items() if not isinstance(value, dict)}
+    tables = {key: {_identifier(k): v for k, v in value.items()} for key, value in settings.items() if isinstance(value, dict)}
+
+    for key in everywhere:
+        if not any(key in names for names in options.values()):
+            raise UsageError(f"{path}: no command has an option {_flag(key)}; remove the key or correct it")
+    for table, values in tables.items():
+        if table not in options:
+            raise UsageError(f"{path}: there is no command {table}; tables are named {', '.join(options)}")
+        for key in values:
+            if key not in options[table]:
+                raise UsageError(f"{path}: {table} has no option {_flag(key)}; see pcdenoise {table} --help")
+    known = options[str(context.info_name)]
+    merged = {**everywhere, **tables.get(str(context.info_name), {})}
+    return {key: _as_typed_on_a_command_line(value) for key, value in merged.items() if key in known}
+
+
+def _as_typed_on_a_command_line(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_as_typed_on_a_command_line(item) for item in value]
+    return value if isinstance(value, bool) else str(value)
+
+
+def _identifier(key: str) -> str:
+    return key.replace("-", "_")
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def configured(model: type[ConfigModel], **values: Any) -> ConfigModel:
+    """A frozen configuration from option values. Raises UsageError that names the first wrong flag, its fault and its value."""
+    from pydantic import ValidationError
+
+    try:
+        return model(**values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = _flag(str(first["loc"][0])) if first["loc"] else "options"
+        message = first["msg"].removeprefix("Value error, ")
+        raise UsageError(f"{name}: {message[0].lower()}{message[1:]}, got {first['input']!r}") from None
+
+
+Inputs = Annotated[
+    list[str], argument(metavar="IN...", help="Scans: files, folders, patterns like 'tiles/*.laz', or - for stdin.")
+]
+Output = Annotated[str, option("--output", "-o", metavar="OUT", help="A file, a folder (for several inputs), or - for stdout.")]
+Config = Annotated[
+    Path | None,
+    common("--config", is_eager=True, callback=_apply_config, metavar="FILE", help="TOML file with values for any options."),
+]
+Format = Annotated[
+    Literal["las", "laz", "ply", "xyz", "pcd", "bin"] | None,
+    option("--format", help="Format of - and of files without a known suffix; into a folder: convert to it."),
+]
+Model = Annotated[
+    str | None, option("--model", metavar="NAME|DIR", help="A shipped model (see pcdenoise models) or a model folder.")
+]
+Report = Annotated[
+    Path | None, option("--report", metavar="FILE", help="Write figures and settings to a .json, .csv or .html file.")
+]
+Picture = Annotated[Path | None, option("--picture", metavar="FILE", help="Write a .png picture; needs no display.")]
+Overwrite = Annotated[bool, option("--overwrite", help="Replace files that exist.")]
+Seed = Annotated[int, common("--seed", min=0, help="Same seed, same bytes.")]
+Threads = Annotated[int | None, common("--threads", min=1, help="Threads to use; all cores if not given.")]
+Quiet = Annotated[bool, common("--quiet", "-q", help="Only errors on stderr.")]
+Verbose = Annotated[bool, common("--verbose", "-v", help="More on stderr.")]
+Json = Annotated[bool, option("--json", help="Print JSON instead of a table.")]

@@ -1,0 +1,74 @@
+"""`pcdenoise undo`: a cleaned scan back at its places. How `denoise --displacement` stores them lives here too."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pcdenoise.commands import options
+from pcdenoise.commands.files import format_of, refuse_existing
+from pcdenoise.errors import ScanError
+
+if TYPE_CHECKING:
+    from pcdenoise.cloud.scan import Points, Scan
+
+ORIGINAL = ("original_x", "original_y", "original_z")
+DISPLACEMENT = "displacement"
+"""Columns that `denoise --displacement` adds: the place before, and the distance from it, in the file's unit."""
+
+
+def undo(
+    clean: Annotated[Path, typer.Argument(metavar="CLEAN", help="A scan written with --displacement.")],
+    output: options.Output,
+    format: options.Format = None,
+    overwrite: options.Overwrite = False,
+    config: options.Config = None,
+) -> None:
+    """Take a cleaned scan back to the original, exactly; needs a scan written by denoise --displacement.
+
+    Example: pcdenoise undo clean.laz -o original.laz
+    """
+    from pcdenoise import io
+
+    target = Path(output)
+    refuse_existing([target], overwrite)
+    scan = restored(io.read(clean, format=format_of(clean, format)))
+    io.write(scan, target, format=format_of(target, format), overwrite=overwrite)
+
+
+def with_displacement(before: Points, after: Scan) -> Scan:
+    """The moved scan with four more columns: each row's (N, 3) place before, float64 and so exact, and how far it moved."""
+    import numpy as np
+
+    length = np.nan_to_num(np.linalg.norm(after.points - before, axis=1), nan=0.0, posinf=0.0)
+    columns = {name: before[:, axis].copy() for axis, name in enumerate(ORIGINAL)}
+    return after.with_attributes(**columns, **{DISPLACEMENT: length.astype(np.float32)})
+
+
+def restored(scan: Scan) -> Scan:
+    """The scan before it was moved; the four columns stay, the displacement at zero. Raises ScanError if they are not there.
+
+    A text without a header does not keep names: there the last four columns are taken, if they agree with the coordinates.
+    """
+    import numpy as np
+
+    names = [*ORIGINAL, DISPLACEMENT]
+    if set(names) <= set(scan.attributes) or (names := _last_columns(scan)):
+        before = np.stack([scan.attributes[name].astype(np.float64) for name in names[:3]], axis=1)
+        return scan.moved_to(before).with_attributes(**{names[3]: np.zeros_like(scan.attributes[names[3]])})
+    raise ScanError(f"{scan.origin}: no places before the move are stored; only what denoise --displacement wrote can be undone")
+
+
+def _last_columns(scan: Scan) -> list[str]:
+    """The names of the last four columns of a text, if the last is the distance between the coordinates and the other three."""
+    import numpy as np
+
+    names = list(scan.attributes)[-4:]
+    if scan.format != "xyz" or len(names) < 4:
+        return []
+    *before, displacement = (np.asarray(scan.attributes[name], dtype=np.float64) for name in names)
+    length = np.linalg.norm(scan.points - np.stack(before, axis=1), axis=1)
+    tolerance = 1e-3 * np.nanmax(displacement, initial=0.0)
+    return names if np.allclose(length[scan.finite], displacement[scan.finite], rtol=1e-3, atol=tolerance) else []

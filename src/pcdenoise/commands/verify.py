@@ -1,0 +1,98 @@
+"""`pcdenoise verify`: proof that cleaning changed coordinates and nothing else."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pcdenoise.commands import options
+from pcdenoise.commands.console import figure, table
+from pcdenoise.commands.files import attachments, format_of
+from pcdenoise.commands.options import option
+from pcdenoise.errors import GateError
+
+if TYPE_CHECKING:
+    from pcdenoise.cloud.scan import Scan
+
+
+def verify(
+    before: Annotated[Path, typer.Argument(metavar="BEFORE", help="The scan that went in.")],
+    after: Annotated[Path, typer.Argument(metavar="AFTER", help="The scan that came out.")],
+    max_move: Annotated[float | None, option("--max-move", help="Fail if a point moved farther, in the file's unit.")] = None,
+    format: options.Format = None,
+    as_json: options.Json = False,
+    config: options.Config = None,
+) -> None:
+    """Prove that every row and attribute survived, byte for byte, and say how far points moved. Exit code 5 if not.
+
+    Example: pcdenoise verify scan.laz clean.laz --max-move 0.05
+    """
+    from pcdenoise import io
+
+    findings = compare(io.read(before, format=format_of(before, format)), io.read(after, format=format_of(after, format)))
+    print(json.dumps(findings, indent=2) if as_json else _as_text(findings))
+    if findings["lost"]:
+        raise GateError(f"{after}: not everything of {before} survived: {'; '.join(findings['lost'])}")
+    if max_move is not None and findings["move"]["max"] > max_move:
+        raise GateError(f"{after}: a point moved by {figure(findings['move']['max'])}, the limit is {figure(max_move)}")
+
+
+def compare(before: Scan, after: Scan) -> dict[str, Any]:
+    """What two scans share: attributes row by row, what is beside them, distances moved, and a list of what was lost."""
+    import numpy as np
+
+    if len(before) != len(after):
+        lost = [f"{len(before)} rows became {len(after)}"]
+        return {"rows": [len(before), len(after)], "attributes": {}, "beside": {}, "added": [], "move": {}, "lost": lost}
+    attributes = {}
+    for name, values in before.attributes.items():
+        other = after.attributes.get(name)
+        if other is None:
+            attributes[name] = "missing"
+        elif values.dtype.newbyteorder("=") != other.dtype.newbyteorder("="):
+            attributes[name] = f"{values.dtype} became {other.dtype}"
+        else:
+            n_changed = int(_rows_that_differ(values, other).sum())
+            attributes[name] = f"{n_changed} rows changed" if n_changed else "same"
+    lost = [f"{name}: {verdict}" for name, verdict in attributes.items() if verdict != "same"]
+    beside = {name: name in attachments(after) for name in attachments(before)}
+    lost += [f"{name}: missing" for name, there in beside.items() if not there]
+    if not np.array_equal(before.finite, after.finite):
+        lost.append("rows without numbers (NaN, infinite) are not the same rows")
+    both = before.finite & after.finite
+    move = np.linalg.norm(after.points[both] - before.points[both], axis=1)
+    return {
+        "rows": [len(before), len(after)],
+        "attributes": attributes,
+        "beside": beside,
+        "added": [name for name in after.attributes if name not in before.attributes],
+        "move": {
+            "share": float((move > 0).mean()) if len(move) else 0.0,
+            "median": float(np.median(move)) if len(move) else 0.0,
+            "p95": float(np.quantile(move, 0.95)) if len(move) else 0.0,
+            "max": float(move.max(initial=0.0)),
+        },
+        "lost": lost,
+    }
+
+
+def _rows_that_differ(values: Any, other: Any) -> Any:
+    """(N,) whether the bytes of two columns of one dtype differ; NaN equals the same NaN."""
+    import numpy as np
+
+    as_bytes = [np.ascontiguousarray(column.astype(column.dtype.newbyteorder("="))) for column in (values, other)]
+    rows = [column.reshape(len(column), -1).view(np.uint8) for column in as_bytes]
+    return (rows[0] != rows[1]).any(axis=1)
+
+
+def _as_text(findings: dict[str, Any]) -> str:
+    n_before, n_after = findings["rows"]
+    rows = [["rows", f"{n_before:,}" if n_before == n_after else f"{n_before:,} -> {n_after:,}"]]
+    rows += [[name, verdict] for name, verdict in findings["attributes"].items()]
+    rows += [[name, "there" if there else "missing"] for name, there in findings["beside"].items()]
+    rows += [[name, "added"] for name in findings["added"]]
+    rows += [[f"move, {name}", f"{value:.1%}" if name == "share" else figure(value)] for name, value in findings["move"].items()]
+    return table(["what", "before and after"], rows, left={0, 1})

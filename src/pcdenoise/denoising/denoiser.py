@@ -1,0 +1,196 @@
+"""One pass over a cloud, passes in a row, and when to stop. Not here: files (commands), the network's run (pyramid.py), filters (classical.py)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcdenoise.cloud.neighbours import distinct, spatial_order
+from pcdenoise.cloud.noise_level import NoiseLevel, estimate
+from pcdenoise.cloud.scan import Mask, Points
+from pcdenoise.config import DenoiseConfig
+from pcdenoise.denoising import classical, outliers
+from pcdenoise.denoising.relaxation import relax
+from pcdenoise.errors import ModelError, UsageError
+from pcdenoise.networks.store import Model
+
+FEWEST_POINTS = 16
+"""Smaller clouds come back as they were: no surface can be told from them."""
+_MOST_PASSES = 10
+_WORTHWHILE = 0.75
+"""`auto` goes on while a pass leaves less than this share of the noise that it found."""
+
+Progress = Callable[[str, float], None]
+"""Called with what is being done and the share of it that is done, 0 to 1."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """The cloud after one pass, and its figures: iteration, noise_before, noise_after, move_median, move_max (input's unit)."""
+
+    points: Points
+    figures: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Result:
+    """A cleaned cloud: points (N, 3), outlier (N,), left_alone (N,): rows that were not moved, figures for the report, all steps."""
+
+    points: Points
+    outlier: Mask
+    left_alone: Mask
+    figures: dict[str, Any]
+    steps: list[Step] = field(default_factory=list)
+
+
+def denoise(points: Points, model: Model | None, config: DenoiseConfig, on_progress: Progress | None = None) -> Result:
+    """Moves (N, 3) float64 points onto the surface they were measured on; row i stays row i.
+
+    Rows that are not finite stay as they are; exact duplicates move together. Raises UsageError when the network is asked
+    for without a model.
+    """
+    cloud = _Cloud(points, config)
+    found = np.zeros(len(points), dtype=bool)
+    if config.outliers != "keep" and len(cloud.start) >= FEWEST_POINTS:
+        found = cloud.to_rows(outliers.find(cloud.start, threads=cloud.threads), False)
+    steps = list(_passes(cloud, model, config, on_progress or (lambda _task, _share: None)))
+    moved = cloud.limited(steps[-1].points) if steps else cloud.start
+    result = points.copy()
+    result[cloud.finite] = cloud.to_rows(moved, np.nan)[cloud.finite]
+    unmoved = cloud.to_rows((moved == cloud.start).all(axis=1), True)
+    result[unmoved] = points[unmoved]
+    length = np.linalg.norm(moved - cloud.start, axis=1) if len(moved) else np.zeros(1)
+    figures = {
+        "noise": cloud.level.std,
+        "spacing": cloud.level.spacing,
+        "is_surface": cloud.level.is_surface,
+        "iterations": len(steps),
+        "move_median": float(np.median(length)),
+        "move_p99": float(np.quantile(length, 0.99)),
+        "move_max": float(length.max()),
+        "points_left_alone": int(unmoved.sum()),
+        "points_not_finite": int((~cloud.finite).sum()),
+        "points_coincident": int(cloud.finite.sum()) - len(cloud.start),
+        "outliers": int(found.sum()),
+    }
+    return Result(result, found, unmoved, figures, [Step(cloud.placed(points, s.points), s.figures) for s in steps])
+
+
+def iterate(points: Points, model: Model | None, config: DenoiseConfig) -> Iterator[Step]:
+    """Pass after pass, each fed with the last one's output: (N, 3) points and figures of every step."""
+    cloud = _Cloud(points, config)
+    for step in _passes(cloud, model, config, lambda _task, _share: None):
+        yield Step(cloud.placed(points, cloud.limited(step.points)), step.figures)
+
+
+class _Cloud:
+    """The distinct finite points of an input in spatial order around their own origin, and the way back to its rows."""
+
+    def __init__(self, points: Points, config: DenoiseConfig) -> None:
+        self.config = config
+        self.threads = config.threads or os.cpu_count() or 1
+        self.finite: Mask = np.isfinite(points).all(axis=1)
+        usable = points[self.finite]
+        self.origin = np.round(np.median(usable, axis=0)) if len(usable) else np.zeros(3)
+        usable = usable - self.origin
+        first, place = distinct(usable)
+        order = spatial_order(usable[first])
+        back = np.empty_like(order)
+        back[order] = np.arange(len(order))
+        self.start: Points = usable[first][order]
+        self._row = back[place]
+        self.level: NoiseLevel = estimate(self.start, config.seed, self.threads)
+
+    def to_rows(self, values: NDArray[Any], missing: Any) -> NDArray[Any]:
+        """Values of the distinct points (D, …) spread to all rows (N, …); positions get their origin back."""
+        rows = np.full((len(self.finite), *values.shape[1:]), missing, dtype=values.dtype)
+        rows[self.finite] = values[self._row] + self.origin if values.ndim == 2 else values[self._row]
+        return rows
+
+    def placed(self, points: Points, moved: Points) -> Points:
+        """(N, 3) input rows at their new places."""
+        rows = points.copy()
+        rows[self.finite] = self.to_rows(moved, np.nan)[self.finite]
+        return rows
+
+    def limited(self, moved: Points) -> Points:
+        """Moves scaled by the strength and cut to the longest that is allowed."""
+        move = self.config.strength * (moved - self.start)
+        if self.config.max_move is not None:
+            length = np.linalg.norm(move, axis=1, keepdims=True)
+            move *= np.minimum(1, self.config.max_move / np.maximum(length, 1e-300))
+        return self.start + move
+
+
+def _passes(cloud: _Cloud, model: Model | None, config: DenoiseConfig, on_progress: Progress) -> Iterator[Step]:
+    if len(cloud.start) < FEWEST_POINTS or config.strength == 0:
+        return
+    auto = config.iters == "auto"
+    n_passes = _MOST_PASSES if config.iters == "auto" else config.iters
+    points, level = cloud.start, cloud.level
+    for number in range(1, n_passes + 1):
+        task = f"pass {number}" if auto or n_passes > 1 else "cleaning"
+        moved = _one_pass(points, level, model, config, cloud.threads, lambda share, task=task: on_progress(task, share))
+        after = estimate(moved, config.seed, cloud.threads)
+        length = np.linalg.norm(moved - points, axis=1)
+        figures = {
+            "iteration": number,
+            "noise_before": level.std,
+            "noise_after": after.std,
+            "move_median": float(np.median(length)),
+            "move_max": float(length.max()),
+        }
+        if auto and number > 1 and after.std > _WORTHWHILE * level.std:
+            return
+        points, level = moved, after
+        yield Step(points, figures)
+
+
+def _one_pass(
+    points: Points, level: NoiseLevel, model: Model | None, config: DenoiseConfig, threads: int, on_share: Callable[[float], None]
+) -> Points:
+    if config.method == "mean":
+        return classical.mean(points, config.neighbours, threads=threads)
+    if config.method == "bilateral":
+        return classical.bilateral(points, threads=threads)
+    if config.method == "jet":
+        return classical.jet(points, config.neighbours, threads=threads)
+    if model is None:
+        raise UsageError("--method network needs a model; give --model, or choose --method jet")
+    moved = _network_pass(points, level, model, config.seed, threads, on_share)
+    return relax(moved, level.std, config.relax_steps, threads)
+
+
+def _network_pass(
+    points: Points, level: NoiseLevel, model: Model, seed: int, threads: int, on_share: Callable[[float], None]
+) -> Points:
+    import torch
+
+    from pcdenoise.denoising.pyramid import coarsen, descend, share_of_seeds
+
+    network = model.network
+    torch.set_num_threads(threads)
+    share = share_of_seeds(level, network.config.neighbours)
+    done = 0
+    seeds, count = points, None
+    if share < 1:
+        coarse = coarsen(points, share, seed, threads)
+        seeds, count = coarse.points, coarse.count
+    total = len(seeds) * sum(network.config.rounds) + (len(points) * network.config.landing_rounds if share < 1 else 0)
+
+    def on_block(n: int) -> None:
+        nonlocal done
+        done += n
+        on_share(done / total)
+
+    with torch.inference_mode():
+        descent = descend(network, seeds, count, points if share < 1 else None, level.std, threads=threads, on_block=on_block)
+        moved: Points = (descent.seeds[-1] if descent.landed is None else descent.landed).numpy()
+    if not np.isfinite(moved).all():
+        raise ModelError(f"model {model.name}: gave positions that are not numbers; use another model or --method jet")
+    return moved

@@ -1,0 +1,180 @@
+"""How the projection network is run: raw points to seeds, stages among the seeds, all points landing on their surface.
+
+Coarse to fine in O(N·K), in blocks that fit the cache. Not here: the network itself (networks.projection), passes and stop
+rules (denoiser.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pcdenoise.cloud.neighbours import Indices, NeighbourSearch, coordinate_hash
+from pcdenoise.cloud.noise_level import NoiseLevel
+from pcdenoise.cloud.scan import Points
+from pcdenoise.networks.projection import Edges, Planes, ProjectionNetwork, Stage, edge_features, edges, planes, point_features
+
+_APART = {1: 0.52, 2: 0.39, 3: 0.31, 5: 0.23}
+"""Share of candidates that remain when none may be among the so many nearest of another (measured)."""
+_LANDSCAPE = 11.0
+"""Neighbourhoods hold 11·√(points that show the surface) raw points: the balance of noise, which asks for all of them, and of
+curvature, which asks for few (measured on shapes that serve for nothing else)."""
+BLOCK_POINTS = 4096
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """points (M, 3): means of the raw points in each seed's cell; count (M,): how many they are."""
+
+    points: Points
+    count: NDArray[np.float64]
+
+
+def share_of_seeds(level: NoiseLevel, neighbours: int) -> float:
+    """Seeds per raw point, so that as many seeds as the network looks at stand for the right number of raw points; 1 for little noise."""
+    share = neighbours / (_LANDSCAPE * level.scale_points**0.5)
+    densest = max(_APART.values())
+    return min(share, densest) if share < 1.5 * densest else 1.0
+
+
+def coarsen(points: Points, share: float, seed: int = 0, threads: int = -1) -> Seeds:
+    """About share * N seeds of (N, 3) finite points in spatial order, spread evenly relative to the local density.
+
+    Candidates are drawn by hash; those that are first among their nearest candidates stay, round by round; every raw point
+    then joins its nearest seed. Averaging inside the cells keeps the statistical weight of every raw point.
+    """
+    apart = max((n for n, left in _APART.items() if left >= share), default=1)
+    candidates = points[coordinate_hash(points, seed) < np.uint64(min(share / _APART[apart], 1.0) * float(2**64 - 2**11))]
+    if len(candidates) <= apart + 1:
+        return Seeds(points, np.ones(len(points)))
+    chosen = candidates[_first_among_nearest(candidates, coordinate_hash(candidates, seed + 1), apart, threads)]
+    cell = NeighbourSearch(chosen, threads).knn(points, 1)[1][:, 0]
+    count = np.bincount(cell, minlength=len(chosen)).astype(np.float64)
+    filled = count > 0
+    origin = chosen.mean(axis=0)
+    sums = np.stack([np.bincount(cell, weights=points[:, axis] - origin[axis], minlength=len(chosen)) for axis in range(3)], axis=1)
+    return Seeds(sums[filled] / count[filled, None] + origin, count[filled])
+
+
+def _first_among_nearest(candidates: Points, rank: NDArray[np.uint64], apart: int, threads: int) -> Indices:
+    """Rows of a maximal set in which none is among the nearest of another: greedy in order of rank, all places at once."""
+    n = len(candidates)
+    near = NeighbourSearch(candidates, threads).knn(candidates, apart + 1)[1][:, 1:].ravel()
+    self_ = np.repeat(np.arange(n), apart)
+    ends, others = np.concatenate([self_, near]), np.concatenate([near, self_])
+    place = np.empty(n, dtype=np.int64)
+    place[np.lexsort((np.arange(n), rank))] = np.arange(n)
+    undecided, chosen = np.ones(n, dtype=bool), np.zeros(n, dtype=bool)
+    while undecided.any():
+        best = np.where(undecided, place, n)
+        np.minimum.at(best, ends, np.where(undecided[others], place[others], n))
+        first = undecided & (best == place)
+        chosen |= first
+        undecided &= ~first
+        undecided[others[first[ends]]] = False
+    return np.flatnonzero(chosen)
+
+
+@dataclass(frozen=True)
+class Descent:
+    """What a run of the network gives: the seeds after every stage, (M, 3) each, and the landed raw points (Q, 3), or None without raw points."""
+
+    seeds: list[Tensor]
+    landed: Tensor | None
+
+
+def descend(
+    network: ProjectionNetwork,
+    seeds: Points,
+    count: NDArray[np.float64] | None,
+    raw: Points | None,
+    noise: float,
+    *,
+    block_points: int = BLOCK_POINTS,
+    threads: int = -1,
+    on_block: Callable[[int], None] = lambda _: None,
+) -> Descent:
+    """Runs the network on (M, 3) seeds and lands (Q, 3) raw points on them; differentiable where gradients are on.
+
+    Points stay float64 and only differences between neighbours become float32. The result does not depend on `block_points`.
+    """
+    k = network.config.neighbours
+    points = torch.from_numpy(seeds)
+    weights = None if count is None else torch.from_numpy(count.astype(np.float32))
+    features: Tensor | None = None
+    stages: list[Tensor] = []
+    for stage in network.stages:
+        looking = _Looking(points, points, weights, k, noise, block_points, threads)
+        own = looking.planes()
+        known = looking.embed(stage, own)
+        features = known if features is None else features + known
+        move, features = looking.messages(stage, own, own, features, features, on_block)
+        points = points + move.double()
+        stages.append(points)
+    if raw is None or features is None:
+        return Descent(stages, None)
+    seed_planes = _Looking(points, points, weights, k, noise, block_points, threads).planes()
+    landing = torch.from_numpy(raw)
+    looking = _Looking(landing, points, weights, k, noise, block_points, threads)
+    own = looking.planes()
+    move, _ = looking.messages(network.landing, own, seed_planes, looking.embed(network.landing, own), features, on_block)
+    return Descent(stages, landing + move.double())
+
+
+class _Looking:
+    """M points that look at their nearest sources, block by block; with a single block nothing is computed twice."""
+
+    def __init__(self, points: Tensor, sources: Tensor, count: Tensor | None, k: int, noise: float, block_points: int, threads: int) -> None:
+        self.points, self.sources, self.count, self.noise = points, sources, count, noise
+        index = NeighbourSearch(sources.detach().numpy(), threads).knn(points.detach().numpy(), k)[1]
+        self.index = torch.from_numpy(index.astype(np.int32))
+        n = len(points)
+        self.blocks: Sequence[slice] = [slice(i, min(i + block_points, n)) for i in range(0, n, block_points)]
+        self._only: Edges | None = None
+
+    def graphs(self) -> Iterator[tuple[slice, Edges]]:
+        """Every block with its edges."""
+        for block in self.blocks:
+            if self._only is None or len(self.blocks) > 1:
+                index = self.index[block].long()
+                self._only = edges((self.sources[index] - self.points[block, None]).float(), index, self.count)
+            yield block, self._only
+
+    def planes(self) -> Planes:
+        """Tangent planes of all points."""
+        parts = [planes(graph) for _, graph in self.graphs()]
+        return Planes(torch.cat([p.normal for p in parts]), torch.cat([p.shape for p in parts]))
+
+    def embed(self, stage: Stage, own: Planes) -> Tensor:
+        """(M, C) first features of all points."""
+        return torch.cat([stage.embed(point_features(graph, own.block(block), self.noise)) for block, graph in self.graphs()])
+
+    def messages(
+        self, stage: Stage, own: Planes, theirs: Planes, features: Tensor, sources: Tensor, on_block: Callable[[int], None]
+    ) -> tuple[Tensor, Tensor]:
+        """(M, 3) moves and (M, C) features after all rounds of a stage; among themselves, points hear of each other's news."""
+        among = sources is features
+        cached: tuple[Tensor, Tensor, Tensor] | None = None
+        move = torch.zeros(0)
+        for number, layer in enumerate(stage.rounds):
+            news, moves = [], []
+            heard = layer.hear(features if among else sources)
+            for block, graph in self.graphs():
+                mine = own.block(block)
+                if cached is None or len(self.blocks) > 1:
+                    cached = edge_features(graph, mine, theirs, self.noise)
+                edge, a, b = cached
+                message, new = layer(edge, graph, features[block], heard)
+                news.append(new)
+                if number == len(stage.rounds) - 1:
+                    moves.append(stage.step(message, graph, mine, theirs, a, b))
+                on_block(block.stop - block.start)
+            features = torch.cat(news)
+            if moves:
+                move = torch.cat(moves)
+        return move, features

@@ -1,0 +1,138 @@
+"""Reading and writing scans: one suffix table, one call each way. Not here: any format's details (las, ply, xyz, pcd, kitti).
+
+What was read is written back as it was but for the coordinates that moved: `Scan.source` keeps the file, taken apart.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from pcdenoise.cloud.scan import Mask, Scan
+from pcdenoise.errors import ScanError
+from pcdenoise.io import files, kitti, las, pcd, ply, xyz
+from pcdenoise.io.source import changed, portable
+
+SUFFIXES = {
+    ".las": "las", ".laz": "laz", ".ply": "ply", ".pcd": "pcd", ".bin": "bin",
+    ".xyz": "xyz", ".txt": "xyz", ".csv": "xyz", ".asc": "xyz", ".pts": "xyz",
+}  # fmt: skip
+"""File suffix -> format."""
+
+_MODULES: dict[str, ModuleType] = {"las": las, "laz": las, "ply": ply, "pcd": pcd, "bin": kitti, "xyz": xyz}
+_HEAD = 4096
+
+
+def is_scan(path: str | os.PathLike[str]) -> bool:
+    """Whether the path has a suffix of a scan format."""
+    return Path(path).suffix.lower() in SUFFIXES
+
+
+def read(path: str | os.PathLike[str], *, format: str | None = None) -> Scan:
+    """The scan in a file, or on stdin if the path is '-'.
+
+    The format is the one named, else the suffix's, and must be confirmed by the content; stdin is told by its content.
+    Raises ScanError if the file is missing, damaged, of another format than it says, or holds fewer points than it claims.
+    """
+    is_stdin = os.fspath(path) == files.STREAM
+    origin = "stdin" if is_stdin else os.fspath(path)
+    named = None if is_stdin and format is None else _known(format or _by_suffix(path))
+    raw = files.read_bytes(path)
+    if not raw:
+        raise ScanError(f"{origin}: is empty; check what wrote it")
+    found = _sniffed(raw)
+    named = named or found
+    if _MODULES[named] is not _MODULES[found] and named != "bin":
+        content = "of no known format" if b"\0" in raw[:_HEAD] and found == "xyz" else "text" if found == "xyz" else found
+        raise ScanError(f"{origin}: is taken for {named} but its content is {content}; rename it or name its format")
+    scan: Scan = _MODULES[named].read(raw, origin)
+    return scan
+
+
+def write(
+    scan: Scan,
+    path: str | os.PathLike[str],
+    *,
+    format: str | None = None,
+    overwrite: bool = False,
+    drop_attributes: bool = False,
+    provenance: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a scan to a file, whole or not at all, or to stdout if the path is '-' (`format` is needed then).
+
+    provenance  JSON-ready facts on how the scan was made, kept in a LAS VLR, a PLY or PCD comment; the rest have no place for it.
+    Raises ScanError if the target exists (unless `overwrite`), cannot be written, or its format would drop something `losses`
+    names (unless `drop_attributes`).
+    """
+    target = os.fspath(path)
+    if format is None and target == files.STREAM:
+        raise ScanError("stdout: has no suffix to tell the format by; name the format")
+    named = _known(format or _by_suffix(path))
+    if target.lower().endswith(".copc.laz"):
+        raise ScanError(f"{target}: rows stay in order, so no COPC octree is written; name the file .laz without .copc")
+    lost = losses(scan, named)
+    if lost and not drop_attributes:
+        raise ScanError(f"{target}: {named} would drop {', '.join(lost)}; allow dropping attributes or write .{scan.format}")
+    with files.written(path, overwrite=overwrite) as file:
+        match named:
+            case "las" | "laz":
+                las.write(scan, file, compressed=named == "laz", provenance=provenance)
+            case "ply":
+                ply.write(scan, file, provenance=provenance)
+            case "pcd":
+                pcd.write(scan, file, provenance=provenance)
+            case "bin":
+                kitti.write(scan, file)
+            case _:
+                xyz.write(scan, file, suffix=Path(target).suffix.lower())
+
+
+def losses(scan: Scan, format: str) -> list[str]:
+    """What writing the scan in a format would drop, in words: columns, faces, CRS, VLRs, … Empty if nothing.
+
+    Comment lines and the header's book-keeping (software, dates, identifiers) do not count.
+    """
+    module = _MODULES[_known(format)]
+    own = scan.source is not None and _MODULES.get(scan.format) is module
+    columns = changed(scan) if own else portable(scan.attributes)
+    lost = [] if own or scan.source is None else list(scan.source.attachments())
+    if module is kitti and not own:
+        lost += kitti.coarser(scan.points)
+    return lost + [f"column {name}" for name in module.unstorable(columns)]
+
+
+def select(scan: Scan, keep: Mask) -> Scan:
+    """The rows kept, in order, in memory and in what gets written. Raises ScanError if the file has faces, which name rows."""
+    if keep.shape != (len(scan),):
+        raise ScanError(f"{scan.origin}: {len(scan)} points, {len(keep)} marks; give one mark a point")
+    if scan.source is None:
+        attributes = {name: values[keep] for name, values in scan.attributes.items()}
+        return replace(scan, points=scan.points[keep], attributes=attributes)
+    source = scan.source.selected(keep)
+    new = {name: values[keep] for name, values in changed(scan).items()}
+    return replace(scan, points=scan.points[keep], attributes={**source.columns, **new}, source=source)
+
+
+def _known(format: str) -> str:
+    if format not in _MODULES:
+        raise ScanError(f"format {format} is unknown; choose one of {', '.join(_MODULES)}")
+    return format
+
+
+def _by_suffix(path: str | os.PathLike[str]) -> str:
+    suffix = Path(path).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ScanError(f"{os.fspath(path)}: suffix '{suffix}' is no scan format's ({' '.join(SUFFIXES)}); name the format")
+    return SUFFIXES[suffix]
+
+
+def _sniffed(raw: bytes) -> str:
+    """The format the first bytes show; text if no other."""
+    head = raw[:_HEAD]
+    if las.matches(head):
+        return "laz" if las.is_compressed(head) else "las"
+    return "ply" if ply.matches(head) else "pcd" if pcd.matches(head) else "xyz"

@@ -1,0 +1,93 @@
+"""Bytes in and bytes out: whole-file reads, stdin and stdout, atomic writes. Not here: what the bytes mean."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+import stat
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from pcdenoise.errors import ScanError
+
+STREAM = "-"
+"""The path that means stdin or stdout."""
+
+
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
+    """The whole file, or all of stdin for '-'. Raises ScanError if there is nothing to read from."""
+    if os.fspath(path) == STREAM:
+        if sys.stdin.isatty():
+            raise ScanError("stdin: nothing is piped in; give a file or pipe one to '-'")
+        return sys.stdin.buffer.read()
+    try:
+        return Path(path).read_bytes()
+    except IsADirectoryError:
+        raise ScanError(f"{path}: is a folder; name a scan file") from None
+    except FileNotFoundError:
+        raise ScanError(f"{path}: no such file; check the path") from None
+    except OSError as fault:
+        raise ScanError(f"{path}: cannot be read ({fault.strerror}); check its permissions and the disk") from None
+    except MemoryError:
+        raise ScanError(f"{path}: larger than the free memory; split it into tiles first") from None
+
+
+@contextmanager
+def written(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[BinaryIO]:
+    """A seekable binary file that becomes `path` only if the block ends well; '-' is stdout.
+
+    The bytes go to a hidden file beside the target, which is renamed over it at the end and removed on any failure.
+    Raises ScanError if the target exists and `overwrite` is false, or cannot be written.
+    """
+    target = Path(os.path.realpath(path))
+    if os.fspath(path) == STREAM or (target.exists() and not target.is_dir() and not target.is_file()):
+        with _spooled(path) as file:
+            yield file
+        return
+    _check_target(path, target, overwrite)
+    part = target.with_name(f".{target.name[:100]}.{secrets.token_hex(4)}.part")
+    try:
+        with part.open("xb+") as file:
+            yield file
+        if target.exists():
+            _check_target(path, target, overwrite)
+            part.chmod(stat.S_IMODE(target.stat().st_mode))
+        os.replace(part, target)
+    except OSError as fault:
+        raise ScanError(f"{path}: cannot be written ({fault.strerror}); check the folder's permissions and free space") from None
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _check_target(path: str | os.PathLike[str], target: Path, overwrite: bool) -> None:
+    if target.is_dir():
+        raise ScanError(f"{path}: is a folder; name a file in it")
+    if not target.parent.is_dir():
+        raise ScanError(f"{path}: folder {target.parent} does not exist; create it first")
+    if target.exists() and not overwrite:
+        raise ScanError(f"{path}: exists already; choose another name or allow overwriting")
+
+
+@contextmanager
+def _spooled(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """A temporary file copied to stdout (or to a device or pipe) once complete: LAS writers need to seek, pipes cannot."""
+    with tempfile.TemporaryFile() as spool:
+        yield spool
+        spool.seek(0)
+        try:
+            if os.fspath(path) != STREAM:
+                with open(path, "wb") as device:
+                    shutil.copyfileobj(spool, device)
+                return
+            if sys.stdout.isatty() and b"\0" in spool.read(65536):
+                raise ScanError("stdout: is a terminal and the scan is binary; redirect it to a file or pipe")
+            spool.seek(0)
+            shutil.copyfileobj(spool, sys.stdout.buffer)
+            sys.stdout.buffer.flush()
+        except OSError as fault:
+            raise ScanError(f"{path}: cannot be written ({fault.strerror}); check what reads it") from None

@@ -1,0 +1,180 @@
+"""LAS and LAZ scans: coordinates as scaled integers, dimensions as attributes. Not here: the container (las_file.py)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcdenoise import __version__
+from pcdenoise.cloud.scan import Mask, Points, Scan
+from pcdenoise.errors import ScanError
+from pcdenoise.io import las_file
+from pcdenoise.io.las_dimensions import EXTRA_BYTES, Dimension, extended, structured
+from pcdenoise.io.las_file import HEADER, LasFile
+from pcdenoise.io.source import Column, changed, colours_as_words, portable, step_decimals, storable
+
+_PROVENANCE = (b"pcdenoise", 1)
+_CRS_IS_WKT = 16
+_INT32 = np.iinfo(np.int32)
+_QUANTA = 1e-8
+
+
+@dataclass(frozen=True)
+class LasSource:
+    """A LAS file, its records seen through `dimensions`, and the columns they gave when read."""
+
+    file: LasFile
+    records: NDArray[Any]
+    dimensions: Mapping[str, Dimension]
+    columns: Mapping[str, Column]
+
+    @classmethod
+    def of(cls, file: LasFile) -> LasSource:
+        """The source of a file as it stands."""
+        records, dimensions = structured(file)
+        return cls(file, records, dimensions, {name: dimension.get(records) for name, dimension in dimensions.items()})
+
+    def points(self) -> Points:
+        """(N, 3) float64 world coordinates of the stored integers."""
+        return _coordinates(self.file, self.records)
+
+    def attachments(self) -> list[str]:
+        """CRS, VLRs, EVLRs and waveforms, which only LAS carries."""
+        found = []
+        for user_id, record_id in map(las_file.vlr_identity, self.file.vlrs):
+            if user_id == b"LASF_Projection":
+                found.append("coordinate reference system")
+            elif (user_id, record_id) not in (EXTRA_BYTES, las_file.LASZIP, _PROVENANCE):
+                found.append(f"VLR {user_id.decode('latin-1')}/{record_id}")
+        if n_evlrs := len(self.file.evlrs()):
+            found.append(f"{n_evlrs} EVLRs")
+        if self.file.field("waveforms_start"):
+            found.append("waveform packets")
+        return list(dict.fromkeys(found))
+
+    def selected(self, keep: Mask) -> LasSource:
+        """The file with only these rows; counts and bounds follow."""
+        return LasSource.of(_bounded(_counted(replace(self.file, records=self.file.records[keep]))))
+
+
+def matches(head: bytes) -> bool:
+    """Whether a file starts like LAS or LAZ."""
+    return head[:4] == b"LASF"
+
+
+def is_compressed(head: bytes) -> bool:
+    """Whether the first bytes of a LAS file say that its points are compressed."""
+    return len(head) > 104 and bool(head[104] & 0xC0)
+
+
+def read(raw: bytes, origin: str) -> Scan:
+    """A scan of LAS or LAZ bytes; attributes carry laspy's dimension names. Raises ScanError on damage.
+
+    A COPC file is read as the LAZ file it is. Its octree indexes the old coordinates, so it is written back without it.
+    """
+    source = LasSource.of(las_file.parse(raw, origin).without_copc())
+    return Scan(source.points(), source.columns, "laz" if is_compressed(raw) else "las", origin, source)
+
+
+def unstorable(columns: Mapping[str, Column]) -> list[str]:
+    """The names of columns that LAS cannot hold: text, and names beyond 32 bytes."""
+    return [name for name, values in columns.items() if storable(values) is None or len(name.encode()) > 32]
+
+
+def write(scan: Scan, file: BinaryIO, *, compressed: bool, provenance: Mapping[str, Any] | None = None) -> None:
+    """Write a scan as LAS or LAZ: unmoved coordinates keep their integers. Raises ScanError if a value does not fit."""
+    own = isinstance(scan.source, LasSource)
+    source = scan.source if isinstance(scan.source, LasSource) else _created(scan)
+    columns = changed(scan) if own else colours_as_words(portable(scan.attributes))
+    standing = {
+        name: values
+        for name, values in columns.items()
+        if name in source.dimensions and (own or source.dimensions[name].encoded(source.records, values) is not None)
+    }
+    lost = unstorable(columns)
+    added = {_free(name, source): values for name, values in columns.items() if name not in standing and name not in lost}
+    las = extended(source.file, added, scan.origin)
+    las = replace(las, records=las.records.copy())
+    records, _ = structured(las)
+    for name, values in standing.items():
+        source.dimensions[name].put(records, values, scan.origin)
+    if _move(las, records, scan):
+        las = _bounded(las)
+    if not own:
+        las = _counted(las)
+    if provenance is not None:
+        las = las.with_vlr(*_PROVENANCE, b"how this file was made", json.dumps(provenance).encode())
+        las = las.with_header(software=f"pcdenoise {__version__}".encode())
+    las.write(file, compressed=compressed)
+
+
+def _free(name: str, source: LasSource) -> str:
+    return name + "_" if name in source.dimensions else name
+
+
+def _coordinates(file: LasFile, records: NDArray[Any]) -> Points:
+    scale, offset = file.field("scale"), file.field("offset")
+    return np.stack([records[axis] * scale[i] + offset[i] for i, axis in enumerate("XYZ")], axis=1)
+
+
+def _move(file: LasFile, records: NDArray[Any], scan: Scan) -> bool:
+    """Put the scan's coordinates into the records where they differ from what is there; whether any did."""
+    scale, offset = file.field("scale"), file.field("offset")
+    moved = scan.points != _coordinates(file, records)
+    for i, axis in enumerate("XYZ"):
+        rows = np.flatnonzero(moved[:, i])
+        steps = np.rint((scan.points[rows, i] - offset[i]) / scale[i])
+        beyond = rows[~((steps >= _INT32.min) & (steps <= _INT32.max))]
+        if len(beyond):
+            raise ScanError(
+                f"{scan.origin}: row {beyond[0]} has {axis.lower()} = {scan.points[beyond[0], i]}, beyond what LAS holds "
+                f"at scale {scale[i]} and offset {offset[i]}; limit the move, or write .ply or .xyz"
+            )
+        records[axis][rows] = steps.astype(np.int32)
+    return bool(moved.any())
+
+
+def _bounded(file: LasFile) -> LasFile:
+    """The file with the header's bounds those of its points."""
+    if not len(file.records):
+        return file.with_header(bounds=0.0)
+    points = _coordinates(file, structured(file)[0])
+    return file.with_header(bounds=np.stack([points.max(axis=0), points.min(axis=0)], axis=1))
+
+
+def _counted(file: LasFile) -> LasFile:
+    """The file with the header's point counts those of its points, the legacy ones only where they were in use."""
+    records, dimensions = structured(file)
+    by_return = np.bincount(dimensions["return_number"].get(records), minlength=16)[1:16]
+    counts: dict[str, Any] = {"n_points": len(records), "n_by_return": by_return}
+    if file.point_format < 6 or file.field("legacy_n_points"):
+        counts |= {"legacy_n_points": len(records), "legacy_n_by_return": by_return[:5]}
+    return file.with_header(**counts)
+
+
+def _created(scan: Scan) -> LasSource:
+    """A LAS 1.4 file without columns for the rows of a scan from elsewhere: format 6, 7 with colour, 8 with near infrared.
+
+    The scale is a power of ten at most 1e-8 of the extent, the offset the centre: about 1e8 of the 4e9 steps an integer has.
+    """
+    names = portable(scan.attributes)
+    point_format = 8 if "nir" in names else 7 if {"red", "green", "blue"} <= names.keys() else 6
+    if not scan.finite.all():
+        row = int(np.argmin(scan.finite))
+        raise ScanError(f"{scan.origin}: row {row} has no finite coordinates, which LAS cannot hold; write .ply or .pcd instead")
+    decimals = step_decimals(scan.points, _QUANTA)
+    centre = (scan.points.max(axis=0) + scan.points.min(axis=0)) / 2 if len(scan) else np.zeros(3)
+    records = np.zeros((len(scan), las_file.standard_length(point_format)), np.uint8)
+    file = LasFile(bytes(HEADER.itemsize), (), b"", records, b"", 0).with_header(
+        signature=b"LASF", major=1, minor=4, header_size=HEADER.itemsize, point_format=point_format, global_encoding=_CRS_IS_WKT,
+        software=f"pcdenoise {__version__}".encode(), scale=10.0**-decimals, offset=np.round(centre, min(decimals, 12)),
+    )  # fmt: skip
+    source = LasSource.of(file)
+    for name in ("return_number", "number_of_returns"):
+        source.dimensions[name].put(source.records, np.ones(len(scan), np.uint8), scan.origin)
+    return replace(source, columns={})

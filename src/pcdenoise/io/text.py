@@ -1,0 +1,332 @@
+"""Rows of text fields inside a file's bytes: find, read and replace columns. Not here: which column means what.
+
+The bytes are never turned into a list of lines: a row is a pair of offsets, a change is a splice. XYZ, ASCII PLY and ASCII PCD
+share this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcdenoise.cloud.scan import Mask, Points
+from pcdenoise.errors import ScanError
+from pcdenoise.io.source import Column, step_decimals
+
+Octets = NDArray[np.uint8]
+"""Bytes of a file."""
+Offsets = NDArray[np.int64]
+"""Places in Octets."""
+ColumnIndex = int | Offsets
+"""Which field of a row: the same in all, or (N,) one for each row (fields after a list shift)."""
+
+_BLOCK_BYTES = 4 << 20
+_BLOCK_ROWS = 1 << 16
+_LONGEST_NUMBER = 64
+_LONGEST_TEXT = 256
+_COORDINATE_STEP = 1e-6
+_LF, _CR, _BLANK, _QUOTE = 10, 13, 32, 34
+_BLANKS = bytes(32 if byte <= _BLANK and byte != 9 else byte for byte in range(256))
+_PLAIN = np.array([byte in (9, _LF, _CR) or (_BLANK <= byte < 127 and byte != _QUOTE) for byte in range(256)])
+
+
+@dataclass(frozen=True)
+class NewFields:
+    """Values to write into a column of text: printf format `form`, in the rows chosen; column None appends to every row."""
+
+    values: NDArray[Any]
+    form: str
+    column: ColumnIndex | None = None
+    rows: Mask | None = None
+
+
+@dataclass(frozen=True)
+class TextRows:
+    """N rows of delimited text.
+
+    body        the bytes the rows lie in, with whatever stands between them (comments, blank lines).
+    starts      (N,) offset in `body` of each row's line.
+    ends        (N,) offset past its last byte, before the line ending.
+    delimiter   the separating byte, or None for runs of blanks.
+    origin      the file, for messages.
+    first_line  number of the line that `body` starts with.
+    """
+
+    body: Octets
+    starts: Offsets
+    ends: Offsets
+    delimiter: int | None
+    origin: str
+    first_line: int
+
+    def __len__(self) -> int:
+        return len(self.starts)
+
+    def first_fields(self) -> list[bytes]:
+        """The fields of the first row without the blanks and quotes around them; none if there is no row."""
+        return split_fields(self.body[self.starts[0] : self.ends[0]].tobytes(), self.delimiter) if len(self) else []
+
+    def n_fields(self) -> int:
+        """How many fields every row has at least."""
+        return min((int(_Fields.of(self, *block).counts.min()) for block in self._blocks()), default=0)
+
+    def numbers(self, columns: Sequence[ColumnIndex]) -> list[NDArray[np.float64]]:
+        """(N,) values of each column. Raises ScanError naming the first line where a field is missing or not a number."""
+        if (quick := self._quick_numbers(columns)) is not None:
+            return quick
+        values = [np.empty(len(self)) for _ in columns]
+        for first, last in self._blocks():
+            fields = _Fields.of(self, first, last)
+            for value, column in zip(values, columns, strict=True):
+                value[first:last] = self._parsed(first, *fields.spans(column))
+        return values
+
+    def texts(self, column: ColumnIndex) -> NDArray[Any]:
+        """(N,) fields as strings, cut after 256 bytes."""
+        blocks = [np.empty(0, "S1")]
+        for block in self._blocks():
+            starts, ends = _Fields.of(self, *block).spans(column)
+            blocks.append(_gathered(self.body, starts, np.minimum(ends - starts, _LONGEST_TEXT)))
+        return np.char.decode(np.concatenate(blocks), "utf-8", "replace")
+
+    def decimals(self, column: ColumnIndex) -> tuple[int, bool]:
+        """(most digits after the point, whether all have an exponent), from up to 4096 evenly spread rows."""
+        digits = {True: 0, False: -1}
+        for row in np.unique(np.linspace(0, len(self) - 1, min(len(self), 4096)).astype(np.int64)).tolist():
+            fields = split_fields(self.body[self.starts[row] : self.ends[row]].tobytes(), self.delimiter)
+            mantissa, e, _ = fields[column if isinstance(column, int) else int(column[row])].lower().partition(b"e")
+            digits[bool(e)] = max(digits[bool(e)], len(mantissa.partition(b".")[2]))
+        return (digits[True], True) if digits[False] < 0 else (digits[False], False)
+
+    def rewritten(self, changes: Sequence[NewFields]) -> Iterator[bytes]:
+        """The body with fields replaced and appended, in pieces; changes ordered by column, appended ones last."""
+        joint = "" if self.delimiter is None else chr(self.delimiter)
+        at = 0
+        for first, last in self._blocks() if changes else ():
+            fields = _Fields.of(self, first, last)
+            n = last - first
+            starts, lengths, used = (np.empty((n, len(changes)), dtype) for dtype in (np.int64, np.int64, np.bool_))
+            buffers, sizes = [], np.zeros((n, len(changes)), np.int64)
+            for k, change in enumerate(changes):
+                used[:, k] = True if change.rows is None else change.rows[first:last]
+                chosen = used[:, k]
+                if change.column is None:
+                    starts[:, k], lengths[:, k] = self.ends[first:last], 0
+                else:
+                    begin, end = fields.spans(change.column)
+                    starts[:, k], lengths[:, k] = begin, end - begin
+                form = change.form if change.column is not None else (joint or " ") + change.form
+                buffer, sizes[chosen, k] = _printed(change.values[first:last][chosen], form)
+                buffers.append(buffer)
+            stop = int(self.ends[last - 1])
+            firsts = np.zeros_like(sizes)
+            total = 0
+            for k, buffer in enumerate(buffers):
+                firsts[:, k] = total + np.cumsum(sizes[:, k]) - sizes[:, k]
+                total += len(buffer)
+            yield spliced(
+                self.body[at:stop], starts[used] - at, lengths[used], np.concatenate(buffers), firsts[used], sizes[used]
+            ).tobytes()
+            at = stop
+        yield self.body[at:].tobytes()
+
+    def selected(self, keep: Mask) -> TextRows:
+        """The rows kept; the lines of the others go, what stands between rows stays."""
+        after = self.ends.copy()
+        for byte in (_CR, _LF):
+            inside = after < len(self.body)
+            after[inside] += self.body[after[inside]] == byte
+        removed = np.where(keep, 0, after - self.starts)
+        nothing = np.zeros(len(self) - int(keep.sum()), np.int64)
+        body = spliced(self.body, self.starts[~keep], removed[~keep], self.body[:0], nothing, nothing)
+        shift = (np.cumsum(removed) - removed)[keep]
+        return replace(self, body=body, starts=self.starts[keep] - shift, ends=self.ends[keep] - shift)
+
+    def fault(self, row: int, what: str) -> ScanError:
+        """An error that names the line of a row."""
+        before = self.body[: self.starts[row]]
+        n_lines = int((before == _LF).sum()) or int((before == _CR).sum())
+        return ScanError(f"{self.origin}: line {self.first_line + n_lines}: {what}")
+
+    def _blocks(self) -> Iterator[tuple[int, int]]:
+        """Row ranges of at most 65536 rows and about 4 MB of text."""
+        first = 0
+        while first < len(self):
+            last = int(np.searchsorted(self.starts, self.starts[first] + _BLOCK_BYTES))
+            last = min(max(last, first + 1), first + _BLOCK_ROWS)
+            yield first, last
+            first = last
+
+    def _quick_numbers(self, columns: Sequence[ColumnIndex]) -> list[NDArray[np.float64]] | None:
+        """The columns by numpy's own reader, or None where it does not see the same rows: the careful way then finds out why."""
+        indices = [column for column in columns if isinstance(column, int)]
+        if not len(self) or len(indices) < len(columns):
+            return None
+        span = self.body[self.starts[0] : self.ends[-1]]
+        if not _PLAIN[span].all():  # numpy knows other blanks and no quotes
+            return None
+        text = BytesIO(span.tobytes())
+        delimiter = None if self.delimiter is None else chr(self.delimiter)
+        try:
+            table = np.loadtxt(text, usecols=indices, delimiter=delimiter, comments=None, ndmin=2, encoding="utf-8")
+        except ValueError:
+            return None
+        return list(table.T) if len(table) == len(self) else None
+
+    def _parsed(self, first: int, starts: Offsets, ends: Offsets) -> NDArray[np.float64]:
+        lengths = ends - starts
+        fields = _gathered(self.body, starts, np.minimum(lengths, _LONGEST_NUMBER + 1))
+        try:
+            if int(lengths.max()) > _LONGEST_NUMBER:
+                raise ValueError
+            return fields.astype(np.float64)
+        except ValueError:
+            row = next(i for i, field in enumerate(fields.tolist()) if not is_number(field) or len(field) > _LONGEST_NUMBER)
+            shown = fields[row][:20].decode("utf-8", "replace")
+            raise self.fault(first + row, f"'{shown}' is not a number; correct the line or remove it") from None
+
+
+def find_lines(raw: Octets) -> tuple[Offsets, Offsets]:
+    """(L,) start and end, before the line ending, of every line; LF, CR LF, or CR alone."""
+    breaks = np.flatnonzero(raw == _LF)
+    if not len(breaks):
+        breaks = np.flatnonzero(raw == _CR)
+    if len(raw) and (not len(breaks) or breaks[-1] != len(raw) - 1):
+        breaks = np.append(breaks, len(raw))
+    starts = np.concatenate([np.zeros(min(1, len(breaks)), np.int64), breaks[:-1] + 1])
+    ends = breaks - ((breaks > starts) & (raw[np.maximum(breaks - 1, 0)] == _CR) if len(raw) else 0)
+    return starts, ends
+
+
+def first_visible(raw: Octets, starts: Offsets, ends: Offsets) -> Offsets:
+    """(L,) offset of the first byte of each line that is no blank; the line's end for a blank line."""
+    at = starts.copy()
+    open_ = np.flatnonzero(at < ends)
+    while len(open_):
+        open_ = open_[raw[at[open_]] <= _BLANK]
+        at[open_] += 1
+        open_ = open_[at[open_] < ends[open_]]
+    return at
+
+
+def split_fields(line: bytes, delimiter: int | None) -> list[bytes]:
+    """The fields of one line without the blanks and quotes around them; quoted delimiters do not split."""
+    line = line.translate(_BLANKS)
+    if delimiter is None:
+        return [field.strip(b'"') for field in line.split()]
+    parts = line.split(b'"')
+    cut = b'"'.join(part.replace(bytes([delimiter]), b"\n") if i % 2 == 0 else part for i, part in enumerate(parts))
+    return [field.strip(b' \t"') for field in cut.split(b"\n")]
+
+
+def is_number(field: bytes) -> bool:
+    """Whether a field reads as a number, nan and inf included."""
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return b"_" not in field
+
+
+def spliced(raw: Octets, starts: Offsets, lengths: Offsets, new: Octets, new_starts: Offsets, new_lengths: Offsets) -> Octets:
+    """`raw` with each span (ascending, disjoint) replaced by a piece of `new`."""
+    kept_starts = np.concatenate([np.zeros(1, np.int64), starts + lengths])
+    kept_ends = np.append(starts, len(raw))
+    firsts = np.empty(2 * len(starts) + 1, np.int64)
+    sizes = np.empty_like(firsts)
+    firsts[0::2], sizes[0::2] = kept_starts, kept_ends - kept_starts
+    firsts[1::2], sizes[1::2] = new_starts + len(raw), new_lengths
+    places = np.repeat(firsts - (np.cumsum(sizes) - sizes), sizes) + np.arange(int(sizes.sum()))
+    result: Octets = np.concatenate([raw, new])[places]
+    return result
+
+
+@dataclass(frozen=True)
+class _Fields:
+    """The fields of a block of rows: row i's are `starts[heads[i]]` onwards, `counts[i]` of them."""
+
+    rows: TextRows
+    first: int
+    starts: Offsets
+    ends: Offsets
+    heads: Offsets
+    counts: Offsets
+
+    @classmethod
+    def of(cls, rows: TextRows, first: int, last: int) -> _Fields:
+        row_starts, row_ends = rows.starts[first:last], rows.ends[first:last]
+        base = int(row_starts[0])
+        block = rows.body[base : int(row_ends[-1])]
+        if rows.delimiter is None:
+            edges = np.flatnonzero(np.diff(block > _BLANK, prepend=False, append=False)) + base
+            starts, ends = edges[0::2], edges[1::2]
+        else:
+            places = np.flatnonzero(block == rows.delimiter) + base
+            row = np.searchsorted(row_starts, places, side="right") - 1
+            places, row = places[places < row_ends[row]], row[places < row_ends[row]]
+            quotes = np.flatnonzero(block == _QUOTE) + base
+            if len(quotes):
+                n_before = np.searchsorted(quotes, places) - np.searchsorted(quotes, row_starts)[row]
+                places = places[n_before % 2 == 0]
+            starts = np.sort(np.concatenate([row_starts, places + 1]), kind="stable")
+            ends = np.sort(np.concatenate([row_ends, places]), kind="stable")
+        heads = np.searchsorted(starts, row_starts)
+        return cls(rows, first, starts, ends, heads, np.searchsorted(starts, row_ends, side="right") - heads)
+
+    def spans(self, column: ColumnIndex) -> tuple[Offsets, Offsets]:
+        """Start and end of one field in each row. Raises ScanError naming the first line that lacks it."""
+        index = column if isinstance(column, int) else column[self.first : self.first + len(self.heads)]
+        short = np.flatnonzero(self.counts <= index)
+        if len(short):
+            raise self.rows.fault(
+                self.first + int(short[0]), f"has {self.counts[short[0]]} columns, too few; correct the line or remove it"
+            )
+        starts, ends = self.starts[self.heads + index], self.ends[self.heads + index]
+        while (padding := (starts < ends) & self._is_padding(starts)).any():
+            starts = starts + padding
+        while (padding := (starts < ends) & self._is_padding(ends - 1)).any():
+            ends = ends - padding
+        return starts, ends
+
+    def _is_padding(self, places: Offsets) -> Mask:
+        bytes_there = self.rows.body.take(places, mode="clip")
+        padding: Mask = (bytes_there <= _BLANK) | (bytes_there == _QUOTE)
+        return padding
+
+
+def _gathered(body: Octets, starts: Offsets, lengths: Offsets) -> NDArray[np.bytes_]:
+    """(n,) byte strings of the spans given."""
+    width = max(1, int(lengths.max(initial=0)))
+    columns = np.arange(width)
+    letters = np.where(columns < lengths[:, None], body.take(starts[:, None] + columns, mode="clip"), np.uint8(0))
+    return letters.view(f"S{width}").reshape(-1)
+
+
+def _printed(values: NDArray[Any], form: str) -> tuple[Octets, Offsets]:
+    """Values printed one after the other, and the length of each."""
+    lines = np.frombuffer((f"{form}\n" * len(values) % tuple(values.tolist())).encode(), np.uint8)
+    breaks = np.flatnonzero(lines == _LF)
+    lengths = np.diff(breaks, prepend=-1) - 1
+    return lines[lines != _LF], lengths
+
+
+def coordinates(rows: TextRows, column: ColumnIndex, before: Points, after: Column, moved: Mask) -> NewFields:
+    """New fields for one coordinate of the rows that moved: the column's decimals, but a step of at most 1e-6 of the extent."""
+    needed = step_decimals(before, _COORDINATE_STEP)
+    digits, exponent = rows.decimals(column)
+    if exponent:
+        size = float(np.abs(before[np.isfinite(before)]).max(initial=1.0))
+        return NewFields(after, f"%.{min(max(digits, needed + int(np.ceil(np.log10(size)))), 17)}e", column, moved)
+    return NewFields(after, f"%.{min(max(digits, needed), 17)}f", column, moved)
+
+
+def plain(values: Column, column: ColumnIndex | None = None) -> NewFields:
+    """A column printed so that it reads back as the same numbers, in as few digits as that takes."""
+    if values.dtype.kind == "f":
+        return NewFields(values, "%r", column) if values.dtype == np.float64 else NewFields(values.astype(str), "%s", column)
+    return NewFields(values.astype(np.int64) if values.dtype.kind == "b" else values, "%s", column)

@@ -1,0 +1,234 @@
+"""Text scans (.xyz .txt .csv .asc .pts): any delimiter, header, comments, extra columns. Not here: rows and fields (text.py)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import BinaryIO
+
+import numpy as np
+
+from pcdenoise.cloud.scan import Mask, Points, Scan
+from pcdenoise.errors import ScanError
+from pcdenoise.io.source import Column, changed, colours_as_bytes, exactly, moved_rows, portable, step_decimals
+from pcdenoise.io.source import is_number as holds_numbers
+from pcdenoise.io.text import NewFields, Offsets, TextRows, coordinates, find_lines, first_visible, is_number, plain, split_fields
+
+_DELIMITERS = (ord(";"), ord(","), ord("\t"), None)
+_COMMENTS = (b"#", b"//")
+_BOM = b"\xef\xbb\xbf"
+_NEW_FILE_STEP = 1e-9
+_MOST_TITLES = 1000
+_MOST_COLUMNS = 4096
+_LONGEST_LINE = 1 << 17
+
+
+@dataclass(frozen=True)
+class XyzSource:
+    """A text file: the bytes before the first row, the rows, where x, y and z stand, and the columns as read.
+
+    indices    attribute name -> column.
+    names_end  offset in `head` past the line that names the columns, if one does.
+    count      span in `head` of a .pts file's point count, if there is one.
+    """
+
+    head: bytes
+    rows: TextRows
+    axes: tuple[int, int, int]
+    read_points: Points
+    columns: Mapping[str, Column]
+    indices: Mapping[str, int]
+    names_end: int | None
+    count: tuple[int, int] | None
+
+    def points(self) -> Points:
+        """(N, 3) coordinates as read."""
+        return self.read_points
+
+    def attachments(self) -> list[str]:
+        """Nothing: a text file is its columns."""
+        return []
+
+    def selected(self, keep: Mask) -> XyzSource:
+        """The file with only these lines, its count line corrected. Raises ScanError if none is left."""
+        if not keep.any():
+            raise ScanError(f"{self.rows.origin}: no point is left, and a text scan cannot be empty; write .ply or .las instead")
+        head = self.head
+        if self.count is not None:
+            head = head[: self.count[0]] + str(int(keep.sum())).encode() + head[self.count[1] :]
+        source: XyzSource = read(head + self.rows.selected(keep).body.tobytes(), self.rows.origin).source
+        return source
+
+
+def matches(head: bytes) -> bool:
+    """Whether the first bytes of a file look like text; other formats are asked first."""
+    return b"\0" not in head
+
+
+def read(raw: bytes, origin: str) -> Scan:
+    """A scan of text bytes. Columns are found by the names x, y, z in a header line or comment, else they are the first three.
+
+    Other columns become attributes under their header name, else column_4, column_5, … counted from 1.
+    Raises ScanError naming the first line that lacks a coordinate.
+    """
+    if b"\0" in raw[:65536]:
+        raise ScanError(f"{origin}: is binary or UTF-16, not text; name its real format or save it as UTF-8")
+    octets = np.frombuffer(raw, np.uint8)
+    starts, ends = find_lines(octets)
+    visible = first_visible(octets, starts, ends)
+    layout = _Layout.of(raw, visible, ends, origin)
+    first = octets.take(visible, mode="clip") if len(octets) else octets
+    second = octets.take(visible + 1, mode="clip") if len(octets) else octets
+    is_row = (visible < ends) & (first != ord("#")) & ~((first == ord("/")) & (second == ord("/")))
+    is_row[: layout.first_row] = False
+    body_start = int(starts[layout.first_row])
+    row_starts, row_ends = starts[is_row] - body_start, ends[is_row] - body_start
+    rows = TextRows(octets[body_start:], row_starts, row_ends, layout.delimiter, origin, layout.first_row + 1)
+    if layout.n_claimed > len(rows):
+        raise ScanError(f"{origin}: its count line claims {layout.n_claimed} points, the file holds {len(rows)}; fetch it again")
+    n_fields = len(rows.first_fields())
+    if n_fields > _MOST_COLUMNS:
+        raise ScanError(f"{origin}: line {layout.first_row + 1} has {n_fields} columns, more than any scan; is it a point cloud?")
+    names = _unique([*layout.names, *(f"column_{i + 1}" for i in range(len(layout.names), n_fields))][:n_fields])
+    lowered = [name.lower() for name in names]
+    named = {"x", "y", "z"} <= set(lowered)
+    axes = (lowered.index("x"), lowered.index("y"), lowered.index("z")) if named else (0, 1, 2)
+    points, columns = _columns(rows, axes, names)
+    indices = {name: names.index(name) for name in columns}
+    source = XyzSource(raw[:body_start], rows, axes, points, columns, indices, layout.names_end, layout.count)
+    return Scan(points, columns, "xyz", origin, source)
+
+
+def unstorable(columns: Mapping[str, Column]) -> list[str]:
+    """The names of columns that are text: their blanks and delimiters could break the rows."""
+    return [name for name, values in columns.items() if not holds_numbers(values)]
+
+
+def write(scan: Scan, file: BinaryIO, *, suffix: str = ".xyz") -> None:
+    """Write a scan as text. The file's own lines stay but for moved coordinates and new columns.
+
+    A scan from another format becomes x y z and its columns: comma and header for .csv, a count line for .pts,
+    else blanks under a `#` comment that names the columns if there are more than three.
+    """
+    if isinstance(scan.source, XyzSource):
+        source = scan.source
+        columns = {name: values for name, values in changed(scan).items() if holds_numbers(values)}
+        head, rows = source.head, source.rows
+        before = source.points()
+        moves = [(i, moved_rows(before[:, i], scan.points[:, i])) for i in range(3)]
+        fields = [coordinates(rows, source.axes[i], before, scan.points[:, i], moved) for i, moved in moves if moved.any()]
+        fields += [plain(columns.pop(name), index) for name, index in source.indices.items() if name in columns]
+        fields.sort(key=lambda change: change.column if isinstance(change.column, int) else 0)
+        if source.names_end is not None:
+            joint = " " if rows.delimiter is None else chr(rows.delimiter)
+            head = head[: source.names_end] + "".join(joint + name for name in columns).encode() + head[source.names_end :]
+    else:
+        columns = {name: values for name, values in colours_as_bytes(portable(scan.attributes)).items() if holds_numbers(values)}
+        head, rows = _created(len(scan), suffix, list(columns))
+        form = f"%.{min(step_decimals(scan.points, _NEW_FILE_STEP), 15)}f"
+        fields = [NewFields(scan.points[:, i], form, 0 if i == 0 else None) for i in range(3)]
+    file.write(head)
+    for piece in rows.rewritten([*fields, *(plain(values) for values in columns.values())]):
+        file.write(piece)
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """What the lines before the first row say; `first_row` is that row's line, counted from 0."""
+
+    first_row: int
+    delimiter: int | None
+    names: list[str]
+    names_end: int | None
+    count: tuple[int, int] | None
+    n_claimed: int
+
+    @classmethod
+    def of(cls, raw: bytes, visible: Offsets, ends: Offsets, origin: str) -> _Layout:
+        """Read on to the first line with three numbers; before it stand only comments, one count and lines without a number."""
+        titles: list[tuple[bytes, int]] = []
+        count: tuple[int, int] | None = None
+        for i, (start, end) in enumerate(zip(visible[:_MOST_TITLES].tolist(), ends[:_MOST_TITLES].tolist(), strict=True)):
+            line = raw[start:end].removeprefix(_BOM)
+            if len(line) > _LONGEST_LINE:
+                raise ScanError(f"{origin}: line {i + 1} has {len(line)} bytes; is it a point cloud?")
+            if line.startswith(_COMMENTS):
+                titles.append((line, end))
+                continue
+            best = max(_DELIMITERS, key=lambda delimiter: sum(map(is_number, split_fields(line, delimiter))))
+            fields = split_fields(line, best)
+            n_numbers = sum(map(is_number, fields))
+            if n_numbers >= 3:
+                names, names_end = _names(titles, best, len(fields))
+                return cls(i, best, names, names_end, count, int(raw[slice(*count)]) if count else 0)
+            if count is None and len(fields) == 1 and line.strip().isdigit() and len(line) < 19:
+                count = (end - len(line), end)
+            elif n_numbers:
+                raise ScanError(f"{origin}: line {i + 1}: needs three numbers with a decimal point; correct or remove it")
+            elif line:
+                titles.append((line, end))
+        raise ScanError(f"{origin}: none of the first {_MOST_TITLES} lines has three numbers; it holds no points as text")
+
+
+def _names(titles: Sequence[tuple[bytes, int]], delimiter: int | None, n_fields: int) -> tuple[list[str], int | None]:
+    """The column names in the last title that has x, y and z among them (or is no comment and has one for each column)."""
+    for line, end in reversed(titles):
+        for candidate in (delimiter, *_DELIMITERS):
+            names = [field.decode("utf-8", "replace") for field in split_fields(line.lstrip(b"#/"), candidate)]
+            complete = len(names) == n_fields and not line.startswith(_COMMENTS)
+            if len(names) <= n_fields and (complete or {"x", "y", "z"} <= {name.lower() for name in names}):
+                return names, end
+    return [], None
+
+
+def _unique(names: Sequence[str]) -> list[str]:
+    found: list[str] = []
+    for name in names:
+        while name in found:
+            name += "_"
+        found.append(name)
+    return found
+
+
+def _columns(rows: TextRows, axes: tuple[int, int, int], names: Sequence[str]) -> tuple[Points, dict[str, Column]]:
+    """(N, 3) points, and every other column that all rows have: whole numbers as int64, else float64, else text."""
+    first = rows.first_fields()
+    others = [i for i in range(len(names)) if i not in axes]
+    try:
+        if not all(is_number(first[i]) for i in others):
+            raise ScanError("a column is text")
+        values = rows.numbers([*axes, *others])
+        columns = {names[i]: _whole(rows, i, found) for i, found in zip(others, values[3:], strict=True)}
+        return np.stack(values[:3], axis=1), columns
+    except ScanError:
+        points = np.stack(rows.numbers(axes), axis=1)
+        n_common = rows.n_fields()
+        return points, {names[i]: _number_or_text(rows, i) for i in others if i < n_common}
+
+
+def _number_or_text(rows: TextRows, column: int) -> Column:
+    try:
+        return _whole(rows, column, rows.numbers([column])[0])
+    except ScanError:
+        return rows.texts(column)
+
+
+def _whole(rows: TextRows, column: int, values: Column) -> Column:
+    """The column as int64 if every value is whole; beyond 2^53 its digits are read again, since float64 rounds them."""
+    whole = exactly(values, "i8")
+    if whole is not None and len(whole) and np.abs(values).max() >= 2.0**53:
+        try:
+            return rows.texts(column).astype(np.int64)
+        except (ValueError, OverflowError):
+            return values
+    return values if whole is None else whole
+
+
+def _created(n_rows: int, suffix: str, names: Sequence[str]) -> tuple[bytes, TextRows]:
+    """Head and rows of a new file: each row is one field, to be replaced by x; the others get appended."""
+    delimiter = "," if suffix == ".csv" else " "
+    title = delimiter.join(["x", "y", "z", *(name.replace(delimiter, "_") for name in names)])
+    head = f"{title}\n" if suffix == ".csv" else f"{n_rows}\n" if suffix == ".pts" else f"# {title}\n" if names else ""
+    starts = np.arange(n_rows, dtype=np.int64) * 2
+    body = np.frombuffer(b"0\n" * n_rows, np.uint8)
+    return head.encode(), TextRows(body, starts, starts + 1, None if delimiter == " " else ord(delimiter), "<new>", 1)

@@ -1,0 +1,207 @@
+"""The projection network: every point steps onto the surface that its neighbours' tangent planes agree on.
+
+Here: the network and the tensors it is fed with. Not here: neighbour search, coarse-to-fine order, blocks (denoising),
+losses and training (learning).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+N_EDGE_FEATURES = 8
+N_POINT_FEATURES = 4
+_KERNEL_SHARE = 0.7  # the kernel's unit of length as a share of the distance to the last neighbour
+
+
+@dataclass(frozen=True)
+class ProjectionConfig:
+    """Sizes of the network: feature channels, neighbours per point, rounds of messages in each stage."""
+
+    channels: int = 32
+    neighbours: int = 24
+    rounds: tuple[int, ...] = (2, 2)
+    landing_rounds: int = 1
+
+
+class Edges(NamedTuple):
+    """M points that look at K sources each; everything is relative to the point, in units of its `scale`.
+
+    offset (M, K, 3) source minus point; index (M, K) rows of the sources; weight (M, K) kernel times the number of raw points
+    behind a source, zero at the last neighbour and of sum one; scale (M, 1) length unit in local units.
+    """
+
+    offset: Tensor
+    index: Tensor
+    weight: Tensor
+    scale: Tensor
+
+
+class Planes(NamedTuple):
+    """A tangent plane for each of M points: normal (M, 3), of either sign, and shape (M, 3): square roots of the covariance's eigenvalues."""
+
+    normal: Tensor
+    shape: Tensor
+
+    def block(self, rows: slice) -> Planes:
+        """The planes of some rows."""
+        return Planes(self.normal[rows], self.shape[rows])
+
+
+def edges(offset: Tensor, index: Tensor, count: Tensor | None) -> Edges:
+    """Kernel weights for neighbours sorted by distance. offset (M, K, 3) in any unit, count (N,) raw points per source or None.
+
+    The kernel falls to zero at the last neighbour, so that nothing jumps when a point enters or leaves the neighbourhood.
+    """
+    with torch.no_grad():
+        scale = _KERNEL_SHARE * offset[:, -1].norm(dim=-1, keepdim=True).clamp_min(1e-12)
+        squared = (offset / scale[:, :, None]).square().sum(-1)
+        weight = torch.exp(-squared) * (1 - _KERNEL_SHARE**2 * squared).clamp_min(0).square()
+        if count is not None:
+            weight = weight * count[index]
+        weight = weight / weight.sum(-1, keepdim=True).clamp_min(1e-12)
+    return Edges(offset / scale[:, :, None], index, weight, scale)
+
+
+def planes(graph: Edges) -> Planes:
+    """Weighted PCA of each neighbourhood, without gradient."""
+    with torch.no_grad():
+        offset, weight = graph.offset.double(), graph.weight.double()
+        mean = torch.einsum("mk,mki->mi", weight, offset)
+        spread = offset - mean[:, None]
+        covariance = torch.einsum("mki,mkj->mij", spread * weight[:, :, None], spread)
+        eigenvalues, normal = smallest_eigenvector(covariance)
+        return Planes(normal.to(graph.offset), eigenvalues.clamp_min(0).sqrt().to(graph.offset))
+
+
+def smallest_eigenvector(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Ascending eigenvalues (M, 3) and the unit eigenvector (M, 3) of the smallest, for symmetric (M, 3, 3) float64, in closed form.
+
+    Trigonometric solution of the characteristic cubic (Smith 1961); the vector is the longest cross product of two rows of
+    (A - λI). Where two eigenvalues coincide any vector of their plane is right.
+    """
+    mean = matrix.diagonal(dim1=-2, dim2=-1).mean(-1)
+    identity = torch.eye(3, dtype=matrix.dtype)
+    centred = matrix - mean[:, None, None] * identity
+    size = (centred.square().sum((-2, -1)) / 6).sqrt().clamp_min(1e-150)
+    unit = centred / size[:, None, None]
+    angle = torch.acos((torch.linalg.det(unit) / 2).clamp(-1, 1)) / 3
+    turns = angle[:, None] + torch.tensor([2 * torch.pi / 3, 4 * torch.pi / 3, 0.0], dtype=matrix.dtype)
+    eigenvalues = mean[:, None] + 2 * size[:, None] * torch.cos(turns)
+    rows = unit - 2 * torch.cos(turns[:, 0])[:, None, None] * identity
+    crosses = torch.stack([torch.linalg.cross(rows[:, i], rows[:, j]) for i, j in ((0, 1), (0, 2), (1, 2))], dim=1)
+    length = crosses.norm(dim=-1)
+    best = length.argmax(dim=1)
+    row = torch.arange(len(matrix))
+    vector = crosses[row, best] / length[row, best, None].clamp_min(1e-150)
+    lost = length[row, best] < 1e-12
+    vector[lost] = torch.tensor([0.0, 0.0, 1.0], dtype=matrix.dtype)
+    return eigenvalues, vector
+
+
+def point_features(graph: Edges, plane: Planes, noise: float) -> Tensor:
+    """(M, 4) what a point knows of its surroundings: thickness, narrowness and noise in units of its scale, and whether the noise explains the thickness."""
+    thin, middle, wide = plane.shape.unbind(-1)
+    level = noise / graph.scale[:, 0]
+    return torch.stack([2 * thin, 2 * (wide - middle), 4 * level / (1 + level), thin / (thin + level + 1e-6)], dim=-1)
+
+
+def edge_features(graph: Edges, own: Planes, theirs: Planes, noise: float) -> tuple[Tensor, Tensor, Tensor]:
+    """(M, K, 8) invariants of each edge, and the signed heights a and b (M, K) that they are made of.
+
+    a: height of the neighbour over my plane; b: height of the neighbour's plane over me. All features keep their value when
+    the cloud is rotated or mirrored and when any normal changes its sign.
+    """
+    normal = theirs.normal[graph.index]
+    a = (graph.offset @ own.normal[:, :, None]).squeeze(-1)
+    b = (graph.offset * normal).sum(-1)
+    cosine = (normal @ own.normal[:, :, None]).squeeze(-1)
+    level = (noise / graph.scale + 0.02).expand_as(a)
+    high, deep = a.abs(), b.abs()
+    features = torch.stack(
+        [
+            graph.offset.norm(dim=-1),
+            4 * high,
+            4 * deep,
+            cosine.square(),
+            16 * a * b * cosine,
+            high / (high + level),
+            deep / (deep + level),
+            4 * (graph.weight + 1e-4).sqrt(),
+        ],
+        dim=-1,
+    )
+    return features, a, b
+
+
+class MessageRound(nn.Module):
+    """One exchange between points and their sources, m = MLP(e, h_i, h_j); `head` turns messages into steps, else into features."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.edge = nn.Linear(N_EDGE_FEATURES, channels)
+        self.own = nn.Linear(channels, channels, bias=False)
+        self.their = nn.Linear(channels, channels, bias=False)
+        self.message = nn.Linear(channels, channels)
+        self.update = nn.Linear(2 * channels, channels)
+        self.norm = nn.LayerNorm(channels)
+
+    def hear(self, their: Tensor) -> Tensor:
+        """(N, C) what all sources say, from their features (N, C); done once, not once per edge."""
+        return self.their(their)
+
+    def forward(self, features: Tensor, graph: Edges, own: Tensor, heard: Tensor) -> tuple[Tensor, Tensor]:
+        """Messages (M, K, C) and the points' new features (M, C). features (M, K, 8), own (M, C), heard (N, C)."""
+        hidden = torch.relu(self.edge(features) + self.own(own)[:, None] + heard[graph.index])
+        message = torch.relu(self.message(hidden))
+        mean = (graph.weight[:, None] @ message).squeeze(1)
+        most = (message * (graph.weight / graph.weight.amax(-1, keepdim=True).clamp_min(1e-12))[:, :, None]).amax(1)
+        return message, self.norm(own + self.update(torch.cat([mean, most], dim=-1)))
+
+
+class Step(nn.Module):
+    """Messages to a displacement: every neighbour's plane pulls along its normal, my own plane moves along mine.
+
+        Δx_i = s·( Σ_j w (½+β) b n_j + n_i Σ_j w (½+α) a ),   w = softmax_j(log kernel + ω)
+
+    On a quadric a ≈ -κt²/2 and b ≈ +κt²/2: the sum cancels curvature to second order with plane normals only, so nothing
+    drifts inward. ω, β, α start at zero: an untrained network already is a good classical filter.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.head = nn.Linear(channels, 3)
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)
+
+    def forward(self, message: Tensor, graph: Edges, own: Planes, theirs: Planes, a: Tensor, b: Tensor) -> Tensor:
+        """(M, 3) displacement in the unit of `graph.scale`'s lengths."""
+        sharpness, pull, lift = self.head(message).unbind(-1)
+        weight = graph.weight * torch.exp(4 * torch.tanh(sharpness / 4))
+        weight = weight / weight.sum(-1, keepdim=True).clamp_min(1e-12)
+        pulled = ((weight * (0.5 + pull) * b)[:, None] @ theirs.normal[graph.index]).squeeze(1)
+        lifted = (weight * (0.5 + lift) * a).sum(-1, keepdim=True) * own.normal
+        return graph.scale * (pulled + lifted)
+
+
+class Stage(nn.Module):
+    """Some rounds of messages, then one step."""
+
+    def __init__(self, channels: int, rounds: int) -> None:
+        super().__init__()
+        self.embed = nn.Linear(N_POINT_FEATURES, channels)
+        self.rounds = nn.ModuleList(MessageRound(channels) for _ in range(rounds))
+        self.step = Step(channels)
+
+
+class ProjectionNetwork(nn.Module):
+    """Stages among the seeds, then one `landing` of all points on the seeds' surface. `denoising.pyramid` runs them."""
+
+    def __init__(self, config: ProjectionConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.stages = nn.ModuleList(Stage(config.channels, rounds) for rounds in config.rounds)
+        self.landing = Stage(config.channels, config.landing_rounds)

@@ -1,0 +1,173 @@
+"""Model folders: weights (safetensors), config and card. Nothing is unpickled and no code comes from a file.
+
+    NAME/weights.safetensors   tensors, float32
+    NAME/config.json           {"network": …, "settings": {…}, "training": {…}, "scores": {…}}
+    NAME/README.md             the card: data, noise, seed, command, scores
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from pcdenoise.errors import ModelError
+
+if TYPE_CHECKING:
+    from pcdenoise.networks.projection import ProjectionNetwork
+
+WEIGHTS, CONFIG, CARD = "weights.safetensors", "config.json", "README.md"
+DEFAULT = "default"
+_LARGEST_FILE = 64 * 2**20
+
+
+class _Settings(BaseModel):
+    """Bounds keep a tampered file from asking for more memory than any real network needs."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    channels: int = Field(ge=4, le=256)
+    neighbours: int = Field(ge=6, le=256)
+    rounds: tuple[int, ...] = Field(min_length=1, max_length=8)
+    landing_rounds: int = Field(ge=1, le=8)
+
+
+class ModelConfig(BaseModel):
+    """What config.json holds."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    network: Literal["projection"]
+    settings: _Settings
+    summary: str = ""
+    training: dict[str, Any] = Field(default_factory=dict)
+    scores: dict[str, Any] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Model:
+    """A network ready to run and where it came from. sha256: of the weights file."""
+
+    name: str
+    network: ProjectionNetwork
+    config: ModelConfig
+    sha256: str
+
+
+@dataclass(frozen=True)
+class ModelInfo:
+    """A model folder as `pcdenoise models` lists it."""
+
+    name: str
+    path: Path
+    config: ModelConfig
+    n_parameters: int
+
+
+def shipped() -> Path:
+    """The folder of the models that come with the program."""
+    return Path(str(resources.files("pcdenoise"))) / "models"
+
+
+def available() -> Iterator[ModelInfo]:
+    """The shipped models, by name."""
+    for folder in sorted(path.parent for path in shipped().glob(f"*/{CONFIG}")):
+        yield info(folder)
+
+
+def info(folder: Path) -> ModelInfo:
+    """Reads a model folder's config and counts its parameters. Raises ModelError."""
+    config = _read_config(folder)
+    network = _build(config)
+    return ModelInfo(folder.name, folder, config, sum(p.numel() for p in network.parameters()))
+
+
+def load(name_or_folder: str | Path = DEFAULT) -> Model:
+    """The model of that name among the shipped ones, or in that folder. Raises ModelError when missing, damaged or tampered with."""
+    folder = _find(name_or_folder)
+    config = _read_config(folder)
+    network = _build(config)
+    path = folder / WEIGHTS
+    data = _read(path)
+    from safetensors import SafetensorError
+    from safetensors.torch import load as parse
+
+    try:
+        tensors = parse(data)
+    except (SafetensorError, ValueError, KeyError) as fault:
+        raise ModelError(f"{path}: not a safetensors file ({_first_line(fault)}); copy the model folder again") from None
+    try:
+        network.load_state_dict(tensors)
+    except RuntimeError as fault:
+        raise ModelError(f"{path}: weights do not fit {CONFIG} ({_first_line(fault)}); copy the model folder again") from None
+    if not all(bool(t.isfinite().all()) for t in tensors.values()):
+        raise ModelError(f"{path}: weights are not all numbers; copy the model folder again")
+    return Model(folder.name, network.eval(), config, hashlib.sha256(data).hexdigest())
+
+
+def save(network: ProjectionNetwork, folder: Path, *, summary: str, training: Mapping[str, Any], scores: Mapping[str, Any], card: str) -> None:
+    """Writes a model folder; every file appears whole or not at all."""
+    from safetensors.torch import save as serialise
+
+    folder.mkdir(parents=True, exist_ok=True)
+    config = ModelConfig(
+        network="projection",
+        settings=_Settings(**asdict(network.config)),
+        summary=summary,
+        training=dict(training),
+        scores=dict(scores),
+    )
+    files = {
+        WEIGHTS: serialise({name: tensor.detach().contiguous() for name, tensor in network.state_dict().items()}),
+        CONFIG: (config.model_dump_json(indent=1) + "\n").encode(),
+        CARD: card.encode(),
+    }
+    for name, data in files.items():
+        part = folder / f".{name}.part"
+        part.write_bytes(data)
+        os.replace(part, folder / name)
+
+
+def _find(name_or_folder: str | Path) -> Path:
+    folder = Path(name_or_folder)
+    if (folder / CONFIG).is_file():
+        return folder
+    inside = shipped() / folder
+    if len(folder.parts) == 1 and (inside / CONFIG).is_file():
+        return inside
+    names = ", ".join(path.parent.name for path in sorted(shipped().glob(f"*/{CONFIG}"))) or "none"
+    raise ModelError(f"{name_or_folder}: no such model; give a folder made by `pcdenoise train` or one of: {names}")
+
+
+def _read(path: Path) -> bytes:
+    try:
+        if path.stat().st_size > _LARGEST_FILE:
+            raise ModelError(f"{path}: larger than any model of this program; copy the model folder again")
+        return path.read_bytes()
+    except OSError as fault:
+        raise ModelError(f"{path}: cannot be read ({fault.strerror}); copy the model folder again") from None
+
+
+def _read_config(folder: Path) -> ModelConfig:
+    path = folder / CONFIG
+    try:
+        return ModelConfig.model_validate(json.loads(_read(path)))
+    except (ValidationError, ValueError, RecursionError) as fault:
+        raise ModelError(f"{path}: not a model's config ({_first_line(fault)}); copy the model folder again") from None
+
+
+def _build(config: ModelConfig) -> ProjectionNetwork:
+    from pcdenoise.networks.projection import ProjectionConfig, ProjectionNetwork
+
+    return ProjectionNetwork(ProjectionConfig(**config.settings.model_dump()))
+
+
+def _first_line(fault: BaseException) -> str:
+    return " ".join(str(fault).split())[:160]

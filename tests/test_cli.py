@@ -1,0 +1,283 @@
+"""The command line as a person meets it: exit codes, one-line errors, names, refusal, pipes, settings, quiet."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pcdenoise
+from pcdenoise.commands import main
+
+ROOT = Path(__file__).resolve().parent.parent
+FAST = ["--method", "mean"]
+Run = Callable[..., subprocess.CompletedProcess[bytes]]
+
+
+@pytest.fixture
+def sphere(tmp_path: Path, rng: np.random.Generator) -> Path:
+    """3 000 points of a unit sphere with radial noise of 2 %, as text with an intensity column."""
+    direction = rng.normal(size=(3000, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    points = direction * (1 + rng.normal(scale=0.02, size=(3000, 1)))
+    path = tmp_path / "sphere.xyz"
+    np.savetxt(path, np.column_stack([points, np.arange(3000)]), fmt="%.6f %.6f %.6f %d")
+    return path
+
+
+def columns(path: Path) -> np.ndarray:
+    return np.loadtxt(path)
+
+
+def the_one_line(captured: str) -> str:
+    """The single line of stderr that an expected error is."""
+    lines = captured.splitlines()
+    assert len(lines) == 1, captured
+    assert lines[0].startswith("pcdenoise: ")
+    return lines[0]
+
+
+def test_denoise_moves_points_and_keeps_rows_and_attributes(sphere: Path) -> None:
+    out = sphere.with_name("clean.xyz")
+    assert main(["denoise", str(sphere), "-o", str(out), *FAST]) == 0
+    before, after = columns(sphere), columns(out)
+    assert np.array_equal(before[:, 3], after[:, 3])
+    assert not np.array_equal(before[:, :3], after[:, :3])
+    assert np.linalg.norm(after[:, :3] - before[:, :3], axis=1).max() < 0.3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["denoise", "absent.las", "-o", "x.las"], 3, "absent.las"),
+        (["denoise", "no/such/*.las", "-o", "out/"], 3, "matches no file"),
+        (["info", "broken.las"], 3, "broken.las"),
+        (["denoise", "sphere.xyz", "-o", "x.xyz", "--method", "magic"], 2, "method"),
+        (["denoise", "sphere.xyz", "-o", "x.xyz", "--strength", "1.5"], 2, "--strength"),
+        (["denoise", "sphere.xyz", "-o", "x.xyz", "--iters", "0"], 2, "--iters"),
+        (["denoise", "sphere.xyz", "-o", "x.xyz", "--iters", "many"], 2, "--iters"),
+        (["denoise", "sphere.xyz", "-o", "x.xyz", "--max-move", "-1"], 2, "--max-move"),
+        (["denoise", "sphere.xyz", "-o", "x.xyz", "--model", "no-such-model"], 4, "no-such-model"),
+        (["denoise", "sphere.xyz"], 2, "-o"),
+        (["denoise", "sphere.xyz", "-o", "x.xyz", "--no-such-option"], 2, "--no-such-option"),
+        (["denose", "sphere.xyz"], 2, "denose"),
+        (["train", "-o", "m", "--budget", "soon"], 2, "--budget"),
+        (["undo", "sphere.xyz", "-o", "x.xyz"], 3, "--displacement"),
+    ],
+)
+def test_an_expected_error_is_one_line_with_its_exit_code(
+    arguments: list[str], code: int, words: str, sphere: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(sphere.parent)
+    Path("broken.las").write_bytes(b"LASF" + bytes(50))
+    assert main(arguments) == code
+    captured = capsys.readouterr()
+    assert words in the_one_line(captured.err)
+    assert captured.out == ""
+    assert not Path("x.xyz").exists()
+
+
+def test_an_existing_output_is_refused_before_any_work_and_replaced_when_asked(
+    sphere: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = sphere.with_name("clean.xyz")
+    out.write_text("precious")
+    assert main(["denoise", str(sphere), "-o", str(out), *FAST]) == 3
+    assert "--overwrite" in the_one_line(capsys.readouterr().err)
+    assert out.read_text() == "precious"
+    assert main(["denoise", str(sphere), "-o", str(out), *FAST, "--overwrite"]) == 0
+    assert len(columns(out)) == 3000
+
+
+def test_a_folder_a_pattern_and_a_suffix_name_the_outputs(sphere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(sphere.parent)
+    Path("tiles").mkdir()
+    for name in ("a", "b"):
+        Path(f"tiles/{name}.xyz").write_bytes(sphere.read_bytes())
+    Path("tiles/notes.md").write_text("not a scan")
+    assert main(["denoise", "tiles", "-o", "out", "-q", *FAST]) == 2  # two inputs, and out is no folder
+    assert main(["denoise", "tiles", "-o", "out/", "-q", *FAST]) == 0
+    assert sorted(path.name for path in Path("out").iterdir()) == ["a.xyz", "b.xyz"]
+    assert main(["denoise", "tiles/[ab].xyz", "-o", "out", "--suffix", "_clean", "--format", "ply", "-q", *FAST]) == 0
+    assert sorted(path.name for path in Path("out").glob("*_clean*")) == ["a_clean.ply", "b_clean.ply"]
+
+
+def test_two_inputs_of_one_name_are_not_written_over_each_other(
+    sphere: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(sphere.parent)
+    for folder in ("left", "right"):
+        Path(folder).mkdir()
+        Path(folder, "tile.xyz").write_bytes(sphere.read_bytes())
+    assert main(["denoise", "left", "right", "-o", "out/", *FAST]) == 2
+    assert "tile.xyz" in the_one_line(capsys.readouterr().err)
+
+
+def test_a_batch_goes_on_past_a_broken_input_and_the_report_lists_it(
+    sphere: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(sphere.parent)
+    Path("broken.ply").write_bytes(b"ply\nformat nonsense\n")
+    assert main(["denoise", "broken.ply", "sphere.xyz", "-o", "out/", "--report", "report.json", "-q", *FAST]) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].startswith("pcdenoise: broken.ply")
+    assert lines[-1] == "pcdenoise: 1 of 2 inputs failed; the others are done"
+    assert len(columns(Path("out/sphere.xyz"))) == 3000
+    assert not Path("out/broken.ply").exists()
+    assert "broken.ply" in Path("report.json").read_text()
+
+
+def test_a_pipe_gives_the_bytes_that_a_file_gives(sphere: Path, run: Run) -> None:
+    out = sphere.with_name("clean.xyz")
+    assert main(["denoise", str(sphere), "-o", str(out), "-q", *FAST]) == 0
+    piped = run("denoise", "-", "-o", "-", "--format", "xyz", *FAST, input=sphere.read_bytes())
+    assert piped.returncode == 0, piped.stderr
+    assert piped.stdout == out.read_bytes()
+    assert b"points" in piped.stderr
+
+
+def test_a_reader_that_goes_away_ends_the_command_without_a_traceback(sphere: Path) -> None:
+    shell = f"{sys.executable} -m pcdenoise denoise {sphere} -o - --format xyz --method mean | head -c 10"
+    done = subprocess.run(
+        ["bash", "-c", shell], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT / "src")}, timeout=120
+    )
+    assert "Traceback" not in done.stderr
+    assert "Exception ignored" not in done.stderr
+
+
+def test_quiet_says_nothing_and_normal_says_where_the_result_is(sphere: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = sphere.with_name("clean.xyz")
+    main(["denoise", str(sphere), "-o", str(out), "-q", *FAST])
+    assert capsys.readouterr() == ("", "")
+    main(["denoise", str(sphere), "-o", str(out), "--overwrite", *FAST])
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert str(out) in captured.err
+
+
+def test_the_same_seed_gives_the_same_bytes(sphere: Path) -> None:
+    for name in ("one.ply", "two.ply"):
+        assert main(["denoise", str(sphere), "-o", str(sphere.with_name(name)), "--seed", "7", "-q"]) == 0
+    assert sphere.with_name("one.ply").read_bytes() == sphere.with_name("two.ply").read_bytes()
+
+
+def test_a_dry_run_prints_the_plan_and_writes_nothing(sphere: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = sphere.with_name("clean.xyz")
+    assert main(["denoise", str(sphere), "-o", str(out), "--dry-run"]) == 0
+    captured = capsys.readouterr()
+    assert "3,000" in captured.out
+    assert str(out) in captured.out
+    assert not out.exists()
+
+
+def strength_used(sphere: Path, *arguments: str) -> float:
+    report = sphere.with_name("report.json")
+    code = main(
+        [
+            "denoise",
+            str(sphere),
+            "-o",
+            str(sphere.with_name("c.xyz")),
+            "--overwrite",
+            "--report",
+            str(report),
+            "-q",
+            *FAST,
+            *arguments,
+        ]
+    )
+    assert code == 0
+    return float(json.loads(report.read_text())["settings"]["strength"])
+
+
+def test_a_flag_beats_the_environment_beats_the_file_beats_the_default(sphere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = sphere.with_name("settings.toml")
+    settings.write_text("seed = 3\n[denoise]\nstrength = 0.25\n")
+    assert strength_used(sphere) == 1.0
+    assert strength_used(sphere, "--config", str(settings)) == 0.25
+    monkeypatch.setenv("PCDENOISE_STRENGTH", "0.5")
+    assert strength_used(sphere, "--config", str(settings)) == 0.5
+    assert strength_used(sphere, "--config", str(settings), "--strength", "0.75") == 0.75
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[denoise]\nstrenght = 0.5\n", "--strenght"),
+        ("[denose]\nstrength = 0.5\n", "denose"),
+        ("colour = 1\n", "--colour"),
+        ("strength = \n", "TOML"),
+        ("[denoise]\nstrength = 'half'\n", "strength"),
+    ],
+)
+def test_a_wrong_key_or_value_in_the_config_file_is_refused(
+    text: str, words: str, sphere: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = sphere.with_name("settings.toml")
+    settings.write_text(text)
+    assert main(["denoise", str(sphere), "-o", str(sphere.with_name("c.xyz")), "--config", str(settings), *FAST]) == 2
+    assert words in the_one_line(capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_the_command_with_its_code_and_leaves_nothing(number: signal.Signals, code: int, tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "pcdenoise", "denoise", "-", "-o", "out.xyz", "--format", "xyz", "-v", *FAST],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT / "src")},
+    )  # fmt: skip
+    assert process.stderr is not None
+    assert b"reading" in process.stderr.readline()  # from here on it waits for stdin
+    process.send_signal(number)
+    _, rest = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert b"Traceback" not in rest
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("format", ["xyz", "ply", "pcd", "las", "laz"])
+def test_undo_gives_back_the_very_coordinates_and_attributes(format: str, sphere: Path) -> None:
+    original, clean, back = (sphere.with_name(f"{name}.{format}") for name in ("original", "clean", "back"))
+    pcdenoise.write(pcdenoise.read(sphere), original)
+    assert main(["denoise", str(original), "-o", str(clean), "--displacement", "-q", *FAST]) == 0
+    before, moved = pcdenoise.read(original), pcdenoise.read(clean)
+    assert not np.array_equal(moved.points, before.points)
+    assert main(["undo", str(clean), "-o", str(back)]) == 0
+    after = pcdenoise.read(back)
+    assert np.array_equal(after.points, before.points)
+    for name, values in before.attributes.items():
+        assert np.array_equal(after.attributes[name], values)
+
+
+def test_undo_is_exact_for_float32_coordinates_that_cross_zero(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Near zero the coordinates have far finer steps than the move, so that a stored difference would not bring them back."""
+    points = (rng.normal(size=(2000, 3)) * [1, 1, 1e-3]).astype(np.float32).astype(np.float64)
+    points[:20, 2] = 1e-30
+    original, clean, back = (tmp_path / f"{name}.ply" for name in ("original", "clean", "back"))
+    pcdenoise.write(pcdenoise.Scan(points), original)
+    assert main(["denoise", str(original), "-o", str(clean), "--displacement", "-q", *FAST]) == 0
+    assert main(["undo", str(clean), "-o", str(back)]) == 0
+    assert np.array_equal(pcdenoise.read(back).points, points)
+
+
+def test_verify_passes_a_clean_scan_and_fails_a_changed_attribute_and_a_far_move(
+    sphere: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clean, bad = sphere.with_name("clean.xyz"), sphere.with_name("bad.xyz")
+    assert main(["denoise", str(sphere), "-o", str(clean), "-q", *FAST]) == 0
+    assert main(["verify", str(sphere), str(clean)]) == 0
+    assert main(["verify", str(sphere), str(clean), "--max-move", "1e-9"]) == 5
+    lines = clean.read_text().splitlines(keepends=True)
+    bad.write_text("".join(lines[:10] + [lines[10].replace(" 10\n", " 11\n")] + lines[11:]))
+    capsys.readouterr()
+    assert main(["verify", str(sphere), str(bad)]) == 5
+    assert "1 rows changed" in the_one_line(capsys.readouterr().err)
+    bad.write_text("".join(lines[:-1]))
+    assert main(["verify", str(sphere), str(bad)]) == 5
