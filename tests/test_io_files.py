@@ -146,6 +146,14 @@ def test_a_name_that_its_content_does_not_confirm_is_refused(tmp_path: Path, nam
         _read_bytes(tmp_path, name, raw)
 
 
+def test_utf16_is_told_apart_from_noise_and_a_misfit_names_the_target(tmp_path: Path) -> None:
+    with pytest.raises(ScanError, match="UTF-16"):
+        _read_bytes(tmp_path, "wide.xyz", "1 2 3\n".encode("utf-16"))
+    with pytest.raises(ScanError, match=r"nan\.las: row 1 has no finite"):
+        io.write(Scan(np.array([[0.0, 0, 0], [np.nan, 0, 0]])), tmp_path / "nan.las")
+    assert not (tmp_path / "nan.las").exists()
+
+
 def test_a_format_can_be_named_and_must_be_known(folder: Path) -> None:
     (folder / "noname").write_bytes(SAMPLES["scan.pcd"])
     assert io.read(folder / "noname", format="pcd").format == "pcd"

@@ -10,7 +10,7 @@ import pytest
 import io_samples
 from pcdenoise.cloud.scan import Scan
 from pcdenoise.errors import ScanError
-from pcdenoise.io import text, xyz
+from pcdenoise.io import lines, text, xyz
 
 DIALECTS = pytest.mark.parametrize("dialect", io_samples.XYZ)
 
@@ -88,6 +88,15 @@ def test_columns_are_found_by_name_and_keep_names_and_kinds() -> None:
     assert xyz.read(io_samples.XYZ["big integers"], "sample").attributes["column_4"][0] == 9007199254740993
 
 
+def test_units_in_brackets_do_not_hide_a_coordinate_and_wide_padding_is_no_number() -> None:
+    scan = xyz.read(b"t,Z [m],Y (m),x\n1,2,3,4\n5,6,7,8\n", "sample")
+    assert scan.points.tolist() == [[4, 3, 2], [8, 7, 6]]
+    wide = b"1,2," + b" " * 5000 + b"3\n4,5,6\n# careful\n7,8,9\n"
+    assert xyz.read(wide.replace(b" " * 4000, b""), "padded").points.tolist()[0] == [1, 2, 3]
+    with pytest.raises(ScanError, match="not a number"):
+        xyz.read(wide, "too wide")
+
+
 def test_an_attribute_of_the_file_can_be_replaced() -> None:
     raw = io_samples.XYZ["header in another order"]
     out = written(xyz.read(raw, "sample").with_attributes(Intensity=np.array([70, 80, 90])))
@@ -154,7 +163,7 @@ def test_a_splice_is_what_python_would_do(rng: np.random.Generator) -> None:
         lengths = np.array([len(piece) for piece in pieces])
         joined = np.frombuffer(b"".join(pieces), np.uint8)
         starts, ends = np.array(spans).T
-        out = text.spliced(np.frombuffer(raw, np.uint8), starts, ends - starts, joined, np.cumsum(lengths) - lengths, lengths)
+        out = lines.spliced(np.frombuffer(raw, np.uint8), starts, ends - starts, joined, np.cumsum(lengths) - lengths, lengths)
         assert out.tobytes() == expected + raw[at:]
 
 

@@ -249,6 +249,17 @@ def test_clouds_of_other_rows_stand_beside_the_first(clouds: tuple[np.ndarray, n
         scene.pack({"a": before}, {"error": np.arange(17.0)})
 
 
+def test_clouds_of_as_many_rows_need_not_be_the_same_points(clouds: tuple[np.ndarray, np.ndarray]) -> None:
+    before, after = clouds
+    description, data = scene.pack({"a": before, "b": after[::-1]}, {"x": before[:, 0]}, same_points=False)
+    assert [cloud["paired"] for cloud in description["clouds"]] == [True, False]
+    assert description["colours"][0]["clouds"] == [0]
+    (first, second), colours = unpacked(description, data)
+    rows_of(after, second, description)
+    rows = rows_of(before, first, description)
+    assert np.corrcoef(colours["x"], before[rows, 0])[0, 1] > 0.99
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("points", [np.empty((0, 3)), np.zeros((1, 3)), np.full((5, 3), np.nan)], ids=["empty", "one", "nowhere"])
 def test_degenerate_clouds_make_a_page(tmp_path: Path, points: np.ndarray) -> None:

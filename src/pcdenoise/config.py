@@ -22,7 +22,7 @@ class DenoiseConfig(Settings):
     iters: int | Literal["auto"] = Field(1, description="Passes over the scan; auto stops by itself, without ground truth.")
     strength: float = Field(1.0, ge=0, le=1, description="Share of the move that is carried out.")
     max_move: float | None = Field(None, gt=0, description="Longest move of any point, in the scan's unit.")
-    relax_steps: int = Field(8, ge=0, le=100, description="Steps toward even spacing along the surface, within the noise; 0 for none.")
+    relax_steps: int = Field(8, ge=0, le=100, description="Steps toward even spacing, within the noise; 0 for none.")
     outliers: Literal["keep", "flag", "remove"] = Field("keep", description="What becomes of isolated points.")
     neighbours: int = Field(24, ge=6, le=1024, description="Neighbours of a classical filter.")
     seed: int = Field(0, ge=0, description="Seed of every random choice.")
@@ -32,10 +32,11 @@ class DenoiseConfig(Settings):
 class TrainConfig(Settings):
     """How a network learns."""
 
-    method: Literal["supervised"] = Field("supervised", description="Training signal: supervised learns from surfaces that are known exactly.")
+    method: Literal["supervised"] = Field("supervised", description="Signal; supervised: surfaces that are known exactly.")
     network: Literal["projection"] = Field("projection", description="Architecture.")
     channels: int = Field(32, ge=4, le=256, description="Features per point.")
     rounds: tuple[int, ...] = Field((2, 2), min_length=1, description="Rounds of messages in each stage.")
+    landing_rounds: int = Field(2, ge=1, le=8, description="Rounds of messages in which all points land on the seeds' surface.")
     n_surfaces: int = Field(400, ge=1, description="Different procedural surfaces to learn from.")
     steps: int | None = Field(None, ge=1, description="Clouds to learn from; or give a budget.")
     budget_s: float | None = Field(None, gt=0, description="Seconds to learn for; or give steps.")

@@ -23,6 +23,7 @@ A ball that is filled with noise has 2.3 to 2.9 at any size, a disc of radius R 
 _CLEARER_SHARE = 0.3  # this share of all places must show it: edges and thin parts stay thick at any scale
 _SCALE_STDS = 4.5  # the radius of the neighbourhood of `scale_points`
 
+
 @dataclass(frozen=True)
 class NoiseLevel:
     """std: noise along the normal; spacing: median distance to the nearest other point (both in the points' unit).

@@ -51,7 +51,7 @@ class Scan:
     @property
     def finite(self) -> Mask:
         """(N,) rows whose three coordinates are numbers."""
-        finite: Mask = np.isfinite(self.points).all(axis=1)
+        finite: Mask = np.logical_and.reduce(np.isfinite(self.points), axis=1)
         return finite
 
     def moved_to(self, points: Points) -> Scan:
@@ -70,7 +70,7 @@ class Scan:
 class Frame:
     """A shift and a scale between world (float64) and local (float32) coordinates: local = (world - origin) / unit.
 
-    One float32 step at UTM northings is half a metre; relative to a nearby origin it is below a thousandth of any scanner's noise.
+    One float32 step at UTM northings is half a metre; from a nearby origin it is below a thousandth of any scanner's noise.
     """
 
     origin: NDArray[np.float64]

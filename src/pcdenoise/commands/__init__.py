@@ -21,6 +21,8 @@ EXIT_CODES = """\
 Exit codes: 0 done · 1 some inputs of a batch failed · 2 usage · 3 unreadable or unwritable file · 4 model does not fit ·
 5 a quality gate failed · 130 interrupted, nothing half-written."""
 
+INTERRUPTED = 130
+
 app = typer.Typer(name="pcdenoise", no_args_is_help=True, pretty_exceptions_enable=False, epilog=EXIT_CODES)
 
 _COMMANDS: dict[str, Callable[..., None]] = {
@@ -62,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         code = app(args=arguments, prog_name="pcdenoise", standalone_mode=False)
         sys.stdout.flush()
-        return code if isinstance(code, int) else 0
+        return _fail("interrupted; nothing is half-written", INTERRUPTED) if code == INTERRUPTED else int(code or 0)
     except PcdenoiseError as error:
         return _fail(str(error), error.exit_code)
     except typer.TyperException as error:
@@ -70,6 +72,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         return _fail(f"{where}{error.strerror or error}", ScanError.exit_code)
+    except MemoryError:
+        return _fail("out of memory; free some, or split the scan into tiles", ScanError.exit_code)
     finally:
         signal.signal(signal.SIGTERM, previous)
 

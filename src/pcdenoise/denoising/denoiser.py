@@ -1,4 +1,7 @@
-"""One pass over a cloud, passes in a row, and when to stop. Not here: files (commands), the network's run (pyramid.py), filters (classical.py)."""
+"""One pass over a cloud, passes in a row, and when to stop.
+
+Not here: files (commands), the network's run (pyramid.py), filters (classical.py).
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from pcdenoise.cloud.neighbours import distinct, spatial_order
 from pcdenoise.cloud.noise_level import NoiseLevel, estimate
 from pcdenoise.cloud.scan import Mask, Points
 from pcdenoise.config import DenoiseConfig
-from pcdenoise.denoising import classical, outliers
+from pcdenoise.denoising import classical
 from pcdenoise.denoising.relaxation import relax
 from pcdenoise.errors import ModelError, UsageError
 from pcdenoise.networks.store import Model
@@ -39,7 +42,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Result:
-    """A cleaned cloud: points (N, 3), outlier (N,), left_alone (N,): rows that were not moved, figures for the report, all steps."""
+    """A cleaned cloud: points (N, 3), outlier (N,), left_alone (N,) rows that were not moved, figures for the report, steps."""
 
     points: Points
     outlier: Mask
@@ -57,12 +60,15 @@ def denoise(points: Points, model: Model | None, config: DenoiseConfig, on_progr
     cloud = _Cloud(points, config)
     found = np.zeros(len(points), dtype=bool)
     if config.outliers != "keep" and len(cloud.start) >= FEWEST_POINTS:
+        from pcdenoise.denoising import outliers
+
         found = cloud.to_rows(outliers.find(cloud.start, threads=cloud.threads), False)
     steps = list(_passes(cloud, model, config, on_progress or (lambda _task, _share: None)))
     moved = cloud.limited(steps[-1].points) if steps else cloud.start
     result = points.copy()
     result[cloud.finite] = cloud.to_rows(moved, np.nan)[cloud.finite]
-    unmoved = cloud.to_rows((moved == cloud.start).all(axis=1), True)
+    still: Mask = np.logical_and.reduce(moved == cloud.start, axis=1)
+    unmoved = cloud.to_rows(still, True)
     result[unmoved] = points[unmoved]
     length = np.linalg.norm(moved - cloud.start, axis=1) if len(moved) else np.zeros(1)
     figures = {
@@ -94,7 +100,7 @@ class _Cloud:
     def __init__(self, points: Points, config: DenoiseConfig) -> None:
         self.config = config
         self.threads = config.threads or os.cpu_count() or 1
-        self.finite: Mask = np.isfinite(points).all(axis=1)
+        self.finite: Mask = np.logical_and.reduce(np.isfinite(points), axis=1)
         usable = points[self.finite]
         self.origin = np.round(np.median(usable, axis=0)) if len(usable) else np.zeros(3)
         usable = usable - self.origin

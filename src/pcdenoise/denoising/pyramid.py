@@ -36,7 +36,7 @@ class Seeds:
 
 
 def share_of_seeds(level: NoiseLevel, neighbours: int) -> float:
-    """Seeds per raw point, so that as many seeds as the network looks at stand for the right number of raw points; 1 for little noise."""
+    """Seeds per raw point, so that those the network looks at stand for the right number of raw points; 1 for little noise."""
     share = neighbours / (_LANDSCAPE * level.scale_points**0.5)
     densest = max(_APART.values())
     return min(share, densest) if share < 1.5 * densest else 1.0
@@ -57,7 +57,9 @@ def coarsen(points: Points, share: float, seed: int = 0, threads: int = -1) -> S
     count = np.bincount(cell, minlength=len(chosen)).astype(np.float64)
     filled = count > 0
     origin = chosen.mean(axis=0)
-    sums = np.stack([np.bincount(cell, weights=points[:, axis] - origin[axis], minlength=len(chosen)) for axis in range(3)], axis=1)
+    sums = np.stack(
+        [np.bincount(cell, weights=points[:, axis] - origin[axis], minlength=len(chosen)) for axis in range(3)], axis=1
+    )
     return Seeds(sums[filled] / count[filled, None] + origin, count[filled])
 
 
@@ -82,7 +84,7 @@ def _first_among_nearest(candidates: Points, rank: NDArray[np.uint64], apart: in
 
 @dataclass(frozen=True)
 class Descent:
-    """What a run of the network gives: the seeds after every stage, (M, 3) each, and the landed raw points (Q, 3), or None without raw points."""
+    """What a run of the network gives: the seeds after every stage, (M, 3) each; landed raw points (Q, 3), if any."""
 
     seeds: list[Tensor]
     landed: Tensor | None
@@ -108,7 +110,7 @@ def descend(
     weights = None if count is None else torch.from_numpy(count.astype(np.float32))
     features: Tensor | None = None
     stages: list[Tensor] = []
-    for stage in network.stages:
+    for stage in network.among:
         looking = _Looking(points, points, weights, k, noise, block_points, threads)
         own = looking.planes()
         known = looking.embed(stage, own)
@@ -129,7 +131,9 @@ def descend(
 class _Looking:
     """M points that look at their nearest sources, block by block; with a single block nothing is computed twice."""
 
-    def __init__(self, points: Tensor, sources: Tensor, count: Tensor | None, k: int, noise: float, block_points: int, threads: int) -> None:
+    def __init__(
+        self, points: Tensor, sources: Tensor, count: Tensor | None, k: int, noise: float, block_points: int, threads: int
+    ) -> None:
         self.points, self.sources, self.count, self.noise = points, sources, count, noise
         index = NeighbourSearch(sources.detach().numpy(), threads).knn(points.detach().numpy(), k)[1]
         self.index = torch.from_numpy(index.astype(np.int32))
@@ -161,7 +165,7 @@ class _Looking:
         among = sources is features
         cached: tuple[Tensor, Tensor, Tensor] | None = None
         move = torch.zeros(0)
-        for number, layer in enumerate(stage.rounds):
+        for number, layer in enumerate(stage.exchanges):
             news, moves = [], []
             heard = layer.hear(features if among else sources)
             for block, graph in self.graphs():
@@ -171,7 +175,7 @@ class _Looking:
                 edge, a, b = cached
                 message, new = layer(edge, graph, features[block], heard)
                 news.append(new)
-                if number == len(stage.rounds) - 1:
+                if number == len(stage.exchanges) - 1:
                     moves.append(stage.step(message, graph, mine, theirs, a, b))
                 on_block(block.stop - block.start)
             features = torch.cat(news)

@@ -51,7 +51,7 @@ def _blocks(n: int) -> list[slice]:
 
 
 def _push(points: Points, normals: Points, spacing: NDArray[np.float64], index: NDArray[np.int64], block: slice) -> Points:
-    """(M, 3) one step: repulsion in the tangent plane, faded where normals disagree, plus the mean height of the neighbours' planes."""
+    """(M, 3) one step: repulsion in the tangent plane, faded where normals disagree."""
     own, normal, reach = points[block], normals[block], spacing[block]
     near = index[block, 1:]
     away = own[:, None] - points[near]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from os import PathLike
 from typing import TypeAlias
 
@@ -181,7 +181,7 @@ def _telling_spot(before: Drawing, after: Drawing, cloud: _Cloud, camera: Camera
     score[:half_y], score[-half_y:], score[:, :half_x], score[:, -half_x:] = -np.inf, -np.inf, -np.inf, -np.inf
     y, x = np.unravel_index(int(score.argmax()), score.shape)
     target = cloud.points[after.owner[y, x]] if after.owner[y, x] >= 0 else camera.target
-    close = replace(camera, target=target, half_height=camera.half_height * window[1] / size[1])
+    close = camera.zoomed(size[1] / window[1], target)
     return _Spot(np.array([x, y]) + 0.5, window, close, width / zoom / 2, spacing)
 
 

@@ -48,11 +48,16 @@ _UNITS = {"m": "m", "mm": "mm", "s": "s", "percent": "%", "mb": "MB", "deg": "\u
 class Page:
     """What an HTML report shows besides figures and settings.
 
-    before, after   (N, 3) clouds of the viewer; `after` may have other rows (a prediction and its truth), then it cannot be
-    morphed. steps           named (N, 3) clouds between them, in order: the iterations. colours         named colours, each
-    (N,), (N, 3) or a Scalar; the displacement is added if rows allow. charts          histograms and curves; one of the
-    displacement is added if there are none. pictures        named (H, W, 3) uint8 images. tables          named lists of rows,
-    each a mapping with the same keys.
+    before, after   (N, 3) clouds of the viewer.
+    same_points     whether row i is the same point in both: false for a prediction and its truth, which are shown side by side.
+    steps           named (N, 3) clouds between them, in order: the iterations.
+    names           what the viewer calls before and after.
+    colours         named colours, each (N,), (N, 3) or a Scalar; the displacement is added where it is known.
+    charts          histograms and curves; where there are none, one of the displacement is added.
+    pictures        named (H, W, 3) uint8 images.
+    tables          named lists of rows, each a mapping with the same keys.
+    lead            a line under the title.
+    unit            of the coordinates.
     """
 
     before: Points | None = None
@@ -65,6 +70,7 @@ class Page:
     tables: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)
     lead: str = ""
     unit: str = ""
+    same_points: bool = True
 
 
 def write_report(path: str | PathLike[str], report: Report, page: Page | None = None, *, overwrite: bool = True) -> None:
@@ -185,11 +191,13 @@ def _scene(page: Page) -> tuple[dict[str, Any] | None, str]:
     colours = dict(page.colours)
     if (moved := _displacement(page)) is not None and "displacement" not in colours:
         colours["displacement"] = moved
-    return pack(clouds, colours, page.unit)
+    return pack(clouds, colours, page.unit, same_points=page.same_points)
 
 
 def _displacement(page: Page) -> Scalar | None:
-    return None if page.before is None or page.after is None else displacement(page.before, page.after, page.unit)
+    if page.before is None or page.after is None or not page.same_points:
+        return None
+    return displacement(page.before, page.after, page.unit)
 
 
 def _displacement_chart(page: Page) -> list[Chart]:

@@ -34,15 +34,17 @@ Integers = NDArray[np.int64]
 Corner = NDArray[np.float64]
 
 
-def pack(clouds: Mapping[str, Points], colours: Mapping[str, Colour], unit: str = "") -> tuple[dict[str, Any], str]:
+def pack(
+    clouds: Mapping[str, Points], colours: Mapping[str, Colour], unit: str = "", *, same_points: bool = True
+) -> tuple[dict[str, Any], str]:
     """Named clouds, the first one the original, as (description, base64 data) for viewer.html.
 
-    Clouds with the rows of the first are shown as stages of one another, others beside it; a colour belongs to the clouds that
-    have its number of rows. At most MOST_POINTS points of a cloud go in, evenly thinned; rows that are not finite or far away
-    do not. Raises UsageError if a colour fits no cloud.
+    Clouds of as many rows as the first are its stages, if `same_points`; others are shown beside it. A colour belongs to the
+    first cloud of its number of rows, and to that one's stages. At most MOST_POINTS points of a cloud go in, evenly thinned;
+    rows that are not finite or far away do not. Raises UsageError if a colour fits no cloud.
     """
     points = list(clouds.values())
-    paired = [len(cloud) == len(points[0]) for cloud in points]
+    paired = [place == 0 or (same_points and len(cloud) == len(points[0])) for place, cloud in enumerate(points)]
     low, high = _box(points)
     step = float((high - low).max()) / _BOX_STEPS or 1.0
     rows = _shown_rows(points, paired, low, high)
@@ -57,11 +59,13 @@ def pack(clouds: Mapping[str, Points], colours: Mapping[str, Colour], unit: str 
     described = []
     for name, colour in colours.items():
         if colour is not None:
-            fits = [place for place, cloud in enumerate(points) if len(cloud) == len(_values(colour))]
-            if not fits:
-                raise UsageError(f"colour {name}: {len(_values(colour))} rows fit no cloud; give one per point")
-            description, planes = _colour(name, colour, rows[fits[0]])
-            described.append({**description, "clouds": fits})
+            n = len(_values(colour))
+            fit = next((place for place, cloud in enumerate(points) if len(cloud) == n), None)
+            if fit is None:
+                raise UsageError(f"colour {name}: {n} rows fit no cloud; give one per point")
+            description, planes = _colour(name, colour, rows[fit])
+            shown_on = [place for place, pair in enumerate(paired) if place == fit or (pair and fit == 0)]
+            described.append({**description, "clouds": shown_on})
             parts.append(planes)
     description = {
         "clouds": [

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, BinaryIO
 
 from pcdenoise.cloud.scan import Mask, Scan
 from pcdenoise.errors import ScanError
@@ -44,12 +44,11 @@ def read(path: str | os.PathLike[str], *, format: str | None = None) -> Scan:
     raw = files.read_bytes(path)
     if not raw:
         raise ScanError(f"{origin}: is empty; check what wrote it")
-    found = _sniffed(raw)
-    named = named or found
-    if _MODULES[named] is not _MODULES[found] and named != "bin":
-        content = "of no known format" if b"\0" in raw[:_HEAD] and found == "xyz" else "text" if found == "xyz" else found
-        raise ScanError(f"{origin}: is taken for {named} but its content is {content}; rename it or name its format")
-    scan: Scan = _MODULES[named].read(raw, origin)
+    found = _sniffed(raw[:_HEAD])
+    if named != "bin" and not (found and _MODULES[named or found] is _MODULES[found]):
+        content = {"xyz": "text", "": "of no known format"}.get(found, found)
+        raise ScanError(f"{origin}: is taken for {named or 'a scan'} but its content is {content}; rename it or name its format")
+    scan: Scan = _MODULES[named or found].read(raw, origin)
     return scan
 
 
@@ -78,23 +77,17 @@ def write(
     if lost and not drop_attributes:
         raise ScanError(f"{target}: {named} would drop {', '.join(lost)}; allow dropping attributes or write .{scan.format}")
     with files.written(path, overwrite=overwrite) as file:
-        match named:
-            case "las" | "laz":
-                las.write(scan, file, compressed=named == "laz", provenance=provenance)
-            case "ply":
-                ply.write(scan, file, provenance=provenance)
-            case "pcd":
-                pcd.write(scan, file, provenance=provenance)
-            case "bin":
-                kitti.write(scan, file)
-            case _:
-                xyz.write(scan, file, suffix=Path(target).suffix.lower())
+        try:
+            _encode(scan, file, named, Path(target).suffix.lower(), provenance)
+        except ScanError as fault:
+            raise ScanError(f"{target}: {fault}") from None
 
 
 def losses(scan: Scan, format: str) -> list[str]:
     """What writing the scan in a format would drop, in words: columns, faces, CRS, VLRs, … Empty if nothing.
 
-    Comment lines and the header's book-keeping (software, dates, identifiers) do not count.
+    Comment lines, the header's book-keeping (software, dates, identifiers) and a COPC octree, which moved points outdate, do
+    not count.
     """
     module = _MODULES[_known(format)]
     own = scan.source is not None and _MODULES.get(scan.format) is module
@@ -117,6 +110,20 @@ def select(scan: Scan, keep: Mask) -> Scan:
     return replace(scan, points=scan.points[keep], attributes={**source.columns, **new}, source=source)
 
 
+def _encode(scan: Scan, file: BinaryIO, format: str, suffix: str, provenance: Mapping[str, Any] | None) -> None:
+    match format:
+        case "las" | "laz":
+            las.write(scan, file, compressed=format == "laz", provenance=provenance)
+        case "ply":
+            ply.write(scan, file, provenance=provenance)
+        case "pcd":
+            pcd.write(scan, file, provenance=provenance)
+        case "bin":
+            kitti.write(scan, file)
+        case _:
+            xyz.write(scan, file, suffix=suffix)
+
+
 def _known(format: str) -> str:
     if format not in _MODULES:
         raise ScanError(f"format {format} is unknown; choose one of {', '.join(_MODULES)}")
@@ -130,9 +137,8 @@ def _by_suffix(path: str | os.PathLike[str]) -> str:
     return SUFFIXES[suffix]
 
 
-def _sniffed(raw: bytes) -> str:
-    """The format the first bytes show; text if no other."""
-    head = raw[:_HEAD]
+def _sniffed(head: bytes) -> str:
+    """The format that the first bytes show; nothing if none."""
     if las.matches(head):
         return "laz" if las.is_compressed(head) else "las"
-    return "ply" if ply.matches(head) else "pcd" if pcd.matches(head) else "xyz"
+    return "ply" if ply.matches(head) else "pcd" if pcd.matches(head) else "xyz" if xyz.matches(head) else ""

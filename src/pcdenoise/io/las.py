@@ -88,29 +88,37 @@ def unstorable(columns: Mapping[str, Column]) -> list[str]:
 
 def write(scan: Scan, file: BinaryIO, *, compressed: bool, provenance: Mapping[str, Any] | None = None) -> None:
     """Write a scan as LAS or LAZ: unmoved coordinates keep their integers. Raises ScanError if a value does not fit."""
-    own = isinstance(scan.source, LasSource)
-    source = scan.source if isinstance(scan.source, LasSource) else _created(scan)
-    columns = changed(scan) if own else colours_as_words(portable(scan.attributes))
-    standing = {
-        name: values
-        for name, values in columns.items()
-        if name in source.dimensions and (own or source.dimensions[name].encoded(source.records, values) is not None)
-    }
+    own = scan.source if isinstance(scan.source, LasSource) else None
+    source = own or _created(scan)
+    columns = changed(scan) if own else _by_dimension(colours_as_words(portable(scan.attributes)), source)
+    standing = {name: values for name, values in columns.items() if name in source.dimensions}
+    if own is None:  # what a standard dimension cannot hold goes to extra bytes beside it
+        standing = {name: values for name, values in standing.items() if source.dimensions[name].holds(source.records, values)}
     lost = unstorable(columns)
     added = {_free(name, source): values for name, values in columns.items() if name not in standing and name not in lost}
-    las = extended(source.file, added, scan.origin)
-    las = replace(las, records=las.records.copy())
-    records, _ = structured(las)
+    target = extended(source.file, added)
+    target = replace(target, records=target.records.copy())
+    records, _ = structured(target)
     for name, values in standing.items():
-        source.dimensions[name].put(records, values, scan.origin)
-    if _move(las, records, scan):
-        las = _bounded(las)
-    if not own:
-        las = _counted(las)
+        source.dimensions[name].put(records, values)
+    if _move(target, records, scan.points):
+        target = _bounded(target)
+    if own is None:
+        target = _counted(target)
     if provenance is not None:
-        las = las.with_vlr(*_PROVENANCE, b"how this file was made", json.dumps(provenance).encode())
-        las = las.with_header(software=f"pcdenoise {__version__}".encode())
-    las.write(file, compressed=compressed)
+        target = target.with_vlr(*_PROVENANCE, b"how this file was made", json.dumps(provenance).encode())
+        target = target.with_header(software=f"pcdenoise {__version__}".encode())
+    target.write(file, compressed=compressed)
+
+
+def _by_dimension(columns: Mapping[str, Column], source: LasSource) -> dict[str, Column]:
+    """The columns under the dimension's name where theirs is the same but for case and underscores (GpsTime, pointsourceid)."""
+    squeezed = {name.replace("_", ""): name for name in source.dimensions}
+    renamed: dict[str, Column] = {}
+    for name, values in columns.items():
+        new = squeezed.get(name.lower().replace("_", ""), name)
+        renamed[name if new in columns or new in renamed else new] = values
+    return renamed
 
 
 def _free(name: str, source: LasSource) -> str:
@@ -122,17 +130,17 @@ def _coordinates(file: LasFile, records: NDArray[Any]) -> Points:
     return np.stack([records[axis] * scale[i] + offset[i] for i, axis in enumerate("XYZ")], axis=1)
 
 
-def _move(file: LasFile, records: NDArray[Any], scan: Scan) -> bool:
-    """Put the scan's coordinates into the records where they differ from what is there; whether any did."""
+def _move(file: LasFile, records: NDArray[Any], points: Points) -> bool:
+    """Put (N, 3) coordinates into the records where they differ from what is there; whether any did."""
     scale, offset = file.field("scale"), file.field("offset")
-    moved = scan.points != _coordinates(file, records)
+    moved = points != _coordinates(file, records)
     for i, axis in enumerate("XYZ"):
         rows = np.flatnonzero(moved[:, i])
-        steps = np.rint((scan.points[rows, i] - offset[i]) / scale[i])
+        steps = np.rint((points[rows, i] - offset[i]) / scale[i])
         beyond = rows[~((steps >= _INT32.min) & (steps <= _INT32.max))]
         if len(beyond):
             raise ScanError(
-                f"{scan.origin}: row {beyond[0]} has {axis.lower()} = {scan.points[beyond[0], i]}, beyond what LAS holds "
+                f"row {beyond[0]} has {axis.lower()} = {points[beyond[0], i]}, beyond what LAS holds "
                 f"at scale {scale[i]} and offset {offset[i]}; limit the move, or write .ply or .xyz"
             )
         records[axis][rows] = steps.astype(np.int32)
@@ -166,7 +174,7 @@ def _created(scan: Scan) -> LasSource:
     point_format = 8 if "nir" in names else 7 if {"red", "green", "blue"} <= names.keys() else 6
     if not scan.finite.all():
         row = int(np.argmin(scan.finite))
-        raise ScanError(f"{scan.origin}: row {row} has no finite coordinates, which LAS cannot hold; write .ply or .pcd instead")
+        raise ScanError(f"row {row} has no finite coordinates, which LAS cannot hold; write .ply or .pcd instead")
     decimals = step_decimals(scan.points, _QUANTA)
     centre = (scan.points.max(axis=0) + scan.points.min(axis=0)) / 2 if len(scan) else np.zeros(3)
     records = np.zeros((len(scan), las_file.standard_length(point_format)), np.uint8)
@@ -176,5 +184,5 @@ def _created(scan: Scan) -> LasSource:
     )  # fmt: skip
     source = LasSource.of(file)
     for name in ("return_number", "number_of_returns"):
-        source.dimensions[name].put(source.records, np.ones(len(scan), np.uint8), scan.origin)
+        source.dimensions[name].put(source.records, np.ones(len(scan), np.uint8))
     return replace(source, columns={})

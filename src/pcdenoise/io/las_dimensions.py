@@ -45,20 +45,23 @@ class Dimension:
             return (stored & self.mask) >> self._shift
         return stored * self.scale + self.offset if self._scaled else stored
 
-    def encoded(self, records: NDArray[Any], values: Column) -> Column | None:
-        """(N,) values as the record stores them, or None if it cannot."""
+    def holds(self, records: NDArray[Any], values: Column) -> bool:
+        """Whether the record can store (N,) values exactly, or a scaled dimension to the nearest step."""
+        return self._encoded(records, values) is not None
+
+    def put(self, records: NDArray[Any], values: Column) -> None:
+        """Store (N,) values in place. Raises ScanError if the record cannot hold one of them."""
+        stored, fitting = self._stored(records), self._encoded(records, values)
+        if fitting is None:
+            raise ScanError(f"dimension {self.name} ({stored.dtype}) cannot hold the new values; use another name")
+        stored[...] = (stored & ~np.uint8(self.mask)) | (fitting << self._shift) if self.mask else fitting
+
+    def _encoded(self, records: NDArray[Any], values: Column) -> Column | None:
         raw = np.rint((values - self.offset) / self.scale) if self._scaled else values
         fitting = exactly(raw, self._stored(records).dtype)
         if fitting is not None and self.mask and int(fitting.max(initial=0)) > self.mask >> self._shift:
             return None
         return fitting
-
-    def put(self, records: NDArray[Any], values: Column, origin: str) -> None:
-        """Store (N,) values in place. Raises ScanError if the record cannot hold one of them."""
-        stored, fitting = self._stored(records), self.encoded(records, values)
-        if fitting is None:
-            raise ScanError(f"{origin}: dimension {self.name} ({stored.dtype}) cannot hold the new values; use another name")
-        stored[...] = (stored & ~np.uint8(self.mask)) | (fitting << self._shift) if self.mask else fitting
 
     def _stored(self, records: NDArray[Any]) -> Column:
         return records[self.field] if self.element is None else records[self.field][:, self.element]
@@ -98,7 +101,7 @@ def structured(file: LasFile) -> tuple[NDArray[Any], dict[str, Dimension]]:
     return file.records.reshape(-1).view(np.dtype(fields)), dimensions
 
 
-def extended(file: LasFile, columns: Mapping[str, Column], origin: str) -> LasFile:
+def extended(file: LasFile, columns: Mapping[str, Column]) -> LasFile:
     """The file with further extra bytes holding these columns, described in its extra bytes VLR.
 
     Raises ScanError if the extra bytes it has are described wrongly, or a column is no number or its name too long for LAS.
@@ -109,13 +112,13 @@ def extended(file: LasFile, columns: Mapping[str, Column], origin: str) -> LasFi
     n_described = sum(dtype.itemsize * n_elements for dtype, n_elements in map(_number_type, entries))
     n_undescribed = file.records.shape[1] - standard_length(file.point_format) - n_described
     if not 0 <= n_undescribed <= 255:
-        raise ScanError(f"{origin}: extra bytes are described wrongly, so no column can be added; repair its VLR first")
+        raise ScanError("extra bytes are described wrongly, so no column can be added; repair its VLR first")
     data = entries.tobytes() + (_entry(_UNDESCRIBED, 0, n_undescribed) if n_undescribed else b"")
     blocks = [file.records]
     for name, given in columns.items():
         values = storable(given)
         if values is None or len(name.encode()) > 32:
-            raise ScanError(f"{origin}: column {name} ({given.dtype}) cannot be LAS extra bytes; rename it or make it a number")
+            raise ScanError(f"column {name} ({given.dtype}) cannot be LAS extra bytes; rename it or make it a number")
         data += _entry(name, NUMBERS.index(values.dtype.str[1:]) + 1, 0)
         little = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
         blocks.append(little.view(np.uint8).reshape(len(values), little.itemsize))

@@ -1,21 +1,20 @@
 """The bytes of a LAS or LAZ file: header, VLRs, raw point records, all that follows. Not here: what the values mean (las.py).
 
 The parts are kept as bytes and only changed fields are patched, because laspy's own copy drops EVLRs, gaps and unknown header
-bytes. Layouts follow the ASPRS LAS 1.4 R15 specification; the compressed point stream is lazrs' business.
+bytes. Layouts follow the ASPRS LAS 1.4 R15 specification.
 """
 
 from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, replace
-from io import BytesIO
 from typing import Any, BinaryIO
 
-import lazrs
 import numpy as np
 from numpy.typing import NDArray
 
 from pcdenoise.errors import ScanError
+from pcdenoise.io import laz
 
 HEADER = np.dtype(
     [
@@ -28,18 +27,13 @@ HEADER = np.dtype(
 )  # fmt: skip
 """The public header block of LAS 1.4; older versions are prefixes of it. `bounds` is ((max, min) of x, of y, of z)."""
 
+_WAVEFORM_14 = (9, 10)
 _SIZE_BY_MINOR = {0: 227, 1: 227, 2: 227, 3: 235}
 _COMPRESSED = 0x80
 _VLR = struct.Struct("<H16sHH32s")
 _EVLR = struct.Struct("<H16sHQ32s")
 LASZIP = (b"laszip encoded", 22204)
 """Identity of the VLR that says how points are compressed."""
-
-_WAVEFORM_14 = (9, 10)
-_LARGEST_CHUNK = 64 << 20
-_LAYERED = 3
-_N_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # by laszip item: point, RGB, RGB and NIR, waveform packet; extra bytes have one a byte
-_LARGEST_RATIO = 5_000  # points all alike compress 3000 to 1 in chunks of 50000
 
 
 @dataclass(frozen=True)
@@ -121,10 +115,12 @@ class LasFile:
     def write(self, file: BinaryIO, *, compressed: bool) -> None:
         """Write as LAS or LAZ at the start of a seekable file. Raises ScanError if lazrs cannot hold the records exactly."""
         vlrs = [record for record in self.vlrs if compressed or vlr_identity(record) != LASZIP]
+        n_extra = self.records.shape[1] - standard_length(self.point_format)
+        layout = laz.layout(self.point_format, n_extra, self.vlr(*LASZIP))
         if compressed:
             place = next((i for i, record in enumerate(vlrs) if vlr_identity(record) == LASZIP), len(vlrs))
-            vlrs[place : place + 1] = [_laszip_vlr(self.point_format, self.records.shape[1], vlrs[place : place + 1])]
-            laszip = vlrs[place][_VLR.size :]
+            if layout not in self.vlr(*LASZIP)[:1]:
+                vlrs[place : place + 1] = [_VLR.pack(0, *LASZIP, len(layout), b"written by lazrs") + layout]
         points_start = len(self.header) + sum(map(len, vlrs)) + len(self.gap)
         start = self.with_header(
             points_start=points_start,
@@ -134,9 +130,7 @@ class LasFile:
         )
         file.write(start.header + b"".join(vlrs) + self.gap)
         if compressed:
-            _compress(self.records, laszip, file)
-            if self.point_format in _WAVEFORM_14:
-                _check_compressed(self.records, laszip, file, points_start)
+            laz.compress(self.records, layout, file, check=self.point_format in _WAVEFORM_14)
         else:
             file.write(self.records.data)
         shift = file.tell() - self.tail_start
@@ -179,7 +173,10 @@ def parse(raw: bytes, origin: str) -> LasFile:
         raise ScanError(f"{origin}: EVLRs start at byte {evlrs_start} of {len(raw)}; the file is damaged, fetch it again")
     if form & 0xC0:
         tail_start = min((at for at in (waveforms_start, evlrs_start) if points_start < at <= len(raw)), default=len(raw))
-        records = _decompress(raw, points_start, n_points, length, vlrs, origin)
+        layouts = [record[_VLR.size :] for record in vlrs if vlr_identity(record) == LASZIP]
+        if not layouts:
+            raise ScanError(f"{origin}: is compressed but has no laszip VLR; the file is damaged, fetch it again")
+        records = laz.decompress(raw, points_start, n_points, length, layouts[0], origin)
     else:
         held = (len(raw) - points_start) // length
         if n_points > held:
@@ -211,107 +208,3 @@ def _split_vlrs(block: bytes, n_claimed: int) -> tuple[bytes, ...]:
         records.append(block[at:end])
         at = end
     return tuple(records)
-
-
-def _decompress(raw: bytes, start: int, n_points: int, length: int, vlrs: tuple[bytes, ...], origin: str) -> NDArray[np.uint8]:
-    """(n_points, length) records of a LAZ point stream at `start`."""
-    laszip = next((record[_VLR.size :] for record in vlrs if vlr_identity(record) == LASZIP), None)
-    if laszip is None:
-        raise ScanError(f"{origin}: is compressed but has no laszip VLR; the file is damaged, fetch it again")
-    if n_points == 0:
-        return np.empty((0, length), np.uint8)
-    try:
-        item_length = lazrs.LazVlr(laszip).item_size()
-        if item_length != length:
-            raise ScanError(f"{origin}: {length} bytes a point, {item_length} in the laszip VLR; the file is damaged")
-        chunks = _chunk_table(raw, start, laszip)
-        most = _LARGEST_RATIO * (len(raw) - start) // length
-        held = min(most, sum(n for n, _ in chunks)) if chunks else most
-        if n_points > held:
-            raise ScanError(
-                f"{origin}: header claims {n_points} points, the compressed data holds at most {held}; fetch it again"
-            )
-        records = np.empty((n_points, length), np.uint8)
-        source = BytesIO(raw)
-        source.seek(start)
-        in_parallel = chunks and max(n for n, _ in chunks) * length <= _LARGEST_CHUNK  # lazrs makes room for whole chunks
-        decompressor = lazrs.ParLasZipDecompressor if in_parallel else lazrs.LasZipDecompressor
-        decompressor(source, laszip).decompress_many(records.reshape(-1))
-    except MemoryError:
-        raise ScanError(f"{origin}: header claims {n_points} points, more than memory holds; split it into tiles first") from None
-    except lazrs.LazrsError as fault:
-        raise ScanError(f"{origin}: its compressed points cannot be read ({fault}); fetch it again or use .las") from None
-    except BaseException as fault:
-        if type(fault).__name__ != "PanicException":  # how a Rust panic arrives: no Exception, no importable class
-            raise
-        raise ScanError(f"{origin}: the compressed points are damaged; fetch the file again") from None
-    return records
-
-
-def _chunk_table(raw: bytes, start: int, laszip: bytes) -> list[tuple[int, int]]:
-    """(points, bytes) of each compressed chunk; empty if the stream has no table. Raises LazrsError on sizes that cannot be true.
-
-    Checked here because lazrs allocates what the file says, and an allocation that fails ends the process.
-    """
-    (compressor,) = struct.unpack_from("<H", laszip)
-    (table,) = struct.unpack("<q", raw[start : start + 8].ljust(8, b"\xff"))
-    if table == -1:
-        (table,) = struct.unpack("<q", raw[-8:])
-    if not start + 8 <= table <= len(raw) - 8:
-        if compressor == _LAYERED:
-            raise lazrs.LazrsError("no chunk table")
-        return []
-    (n_chunks,) = struct.unpack_from("<I", raw, table + 4)
-    if n_chunks > table - start:
-        raise lazrs.LazrsError(f"a table of {n_chunks} chunks")
-    source = BytesIO(raw)
-    source.seek(start)
-    chunks: list[tuple[int, int]] = lazrs.read_chunk_table(source, lazrs.LazVlr(laszip))
-    if sum(size for _, size in chunks) > table - start - 8:
-        raise lazrs.LazrsError("chunks larger than the file")
-    if compressor == _LAYERED:
-        _check_layers(raw, start + 8, chunks, laszip)
-    return chunks
-
-
-def _check_layers(raw: bytes, at: int, chunks: list[tuple[int, int]], laszip: bytes) -> None:
-    """Raises LazrsError if a layered chunk (a point, a count, each layer's size, the layers) claims more bytes than it has."""
-    items = [struct.unpack_from("<HH", laszip, 34 + 6 * i) for i in range(struct.unpack_from("<H", laszip, 32)[0])]
-    n_layers = sum(_N_LAYERS.get(kind, size) for kind, size in items)
-    for _, size in chunks:
-        first = at + sum(size for _, size in items) + 4
-        layers = np.frombuffer(raw, "<u4", n_layers, first) if first + 4 * n_layers <= at + size else None
-        if layers is None or first + 4 * n_layers + int(layers.sum(dtype=np.uint64)) > at + size:
-            raise lazrs.LazrsError("layers larger than their chunk")
-        at += size
-
-
-def _laszip_vlr(point_format: int, length: int, present: list[bytes]) -> bytes:
-    """The VLR that says how points are compressed: the file's own if lazrs compresses the same way, else lazrs' default."""
-    data: bytes = lazrs.LazVlr.new_for_compression(point_format, length - standard_length(point_format)).record_data()
-    for record in present:
-        own = record[_VLR.size :]
-        same_kind = own[:2] == data[:2] and own[32:] == data[32:]
-        if same_kind and 0 < struct.unpack_from("<I", own, 12)[0] * length <= _LARGEST_CHUNK:
-            return record
-    return _VLR.pack(0, *LASZIP, len(data), b"written by lazrs") + data
-
-
-def _compress(records: NDArray[np.uint8], laszip: bytes, file: BinaryIO) -> None:
-    compressor = lazrs.ParLasZipCompressor(file, lazrs.LazVlr(laszip))
-    block = max(1, (64 << 20) // records.shape[1])
-    for first in range(0, len(records), block):
-        compressor.compress_many(np.ascontiguousarray(records[first : first + block]).reshape(-1))
-    compressor.done()
-
-
-def _check_compressed(records: NDArray[np.uint8], laszip: bytes, file: BinaryIO, start: int) -> None:
-    """Read the points back: lazrs 0.8 scrambles waveform fields of formats 9 and 10 when scanner channels alternate."""
-    end = file.tell()
-    file.seek(start)
-    back = np.empty_like(records)
-    if len(records):
-        lazrs.ParLasZipDecompressor(file, laszip).decompress_many(back.reshape(-1))
-    file.seek(end)
-    if not np.array_equal(back, records):
-        raise ScanError("LAZ cannot hold these waveform packets exactly (several scanner channels); write .las instead")

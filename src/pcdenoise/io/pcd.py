@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from pcdenoise.cloud.scan import Mask, Points, Scan
 from pcdenoise.errors import ScanError
 from pcdenoise.io import lzf, pcd_header
+from pcdenoise.io.lines import find_lines, first_visible, is_number
 from pcdenoise.io.pcd_header import Header
 from pcdenoise.io.records import FixedRecords, Records, TextRecords
 from pcdenoise.io.source import Column, changed, colours_as_bytes, exactly, free_name, narrowest_float, portable, storable
-from pcdenoise.io.text import TextRows, find_lines, first_visible, is_number
+from pcdenoise.io.text import TextRows
 
 _SIZES = struct.Struct("<II")
 _BYTES_OF_COLOUR = {"red": 16, "green": 8, "blue": 0, "alpha": 24}
@@ -229,12 +230,12 @@ def _colour_word(records: Records, label: str) -> NDArray[np.uint32]:
 def _recoloured(source: PcdSource, colours: Mapping[str, Column]) -> Column:
     """The packed colour with some of its bytes replaced. Raises ScanError for ascii files and values beyond a byte."""
     if source.colour is None or isinstance(source.records, TextRecords):
-        raise ScanError(f"{source.origin}: packed colours of an ascii PCD cannot be replaced; write .ply instead")
+        raise ScanError("packed colours of an ascii PCD cannot be replaced; write .ply instead")
     word = _colour_word(source.records, source.colour)
     for name, values in colours.items():
         octet = exactly(values, "u1")
         if octet is None:
-            raise ScanError(f"{source.origin}: {name} is one byte here, which cannot hold the new values; write .ply instead")
+            raise ScanError(f"{name} is one byte here, which cannot hold the new values; write .ply instead")
         shift = _BYTES_OF_COLOUR[name]
         word = word & np.uint32(~(255 << shift) & 0xFFFFFFFF) | octet.astype(np.uint32) << np.uint32(shift)
     return word.view(source.records.column(source.colour).dtype)

@@ -16,10 +16,11 @@ from plyfile import PlyData, PlyElement
 from pcdenoise.cloud.scan import Mask, Points, Scan
 from pcdenoise.errors import ScanError
 from pcdenoise.io import ply_header
+from pcdenoise.io.lines import find_lines, first_visible
 from pcdenoise.io.ply_header import TYPES, Element, Header
 from pcdenoise.io.records import FixedRecords, ListRecords, Records, TextRecords
 from pcdenoise.io.source import Column, changed, colours_as_bytes, exactly, first_exact, free_name, narrowest_float, portable
-from pcdenoise.io.text import ColumnIndex, TextRows, find_lines, first_visible
+from pcdenoise.io.text import ColumnIndex, TextRows
 
 _STORED = {"b1": ("u1",), "f2": ("f4",), "i8": ("i4", "u4", "f8"), "u8": ("u4", "f8")}
 

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from pcdenoise.cloud.scan import Mask, Points
 from pcdenoise.errors import ScanError
+from pcdenoise.io.lines import Octets, Offsets, spliced
 from pcdenoise.io.source import Column, exactly, moved_rows
-from pcdenoise.io.text import ColumnIndex, Octets, Offsets, TextRows, coordinates, plain, spliced
+from pcdenoise.io.text import ColumnIndex, TextRows, coordinates, plain
 
 _AXES = ("x", "y", "z")
 

@@ -20,6 +20,7 @@ _COMMON_NAMES = {
     "r": "red", "g": "green", "b": "blue", "a": "alpha", "diffuse_red": "red", "diffuse_green": "green", "diffuse_blue": "blue",
     "normal_x": "nx", "normal_y": "ny", "normal_z": "nz", "scalar_intensity": "intensity", "gpstime": "gps_time",
 }  # fmt: skip
+_KNOWN = {"red", "green", "blue", "alpha", "nx", "ny", "nz", "intensity", "classification", "label", "time"}
 _COLOURS = ("red", "green", "blue")
 
 
@@ -65,7 +66,8 @@ def portable(attributes: Mapping[str, Column]) -> dict[str, Column]:
     """The columns under the names most formats share (R to red, normal_x to nx, …), unless that name is taken."""
     columns: dict[str, Column] = {}
     for name, values in attributes.items():
-        common = _COMMON_NAMES.get(name.lower(), name.lower())
+        low = name.lower()
+        common = _COMMON_NAMES.get(low, low if low in _KNOWN else name)
         taken = common in columns or (common != name and common in attributes)
         columns[name if taken else common] = values
     return columns

@@ -1,4 +1,4 @@
-"""Rows of text fields inside a file's bytes: find, read and replace columns. Not here: which column means what.
+"""Rows of text fields inside a file's bytes: read, replace and append columns. Not here: which column means what.
 
 The bytes are never turned into a list of lines: a row is a pair of offsets, a change is a splice. XYZ, ASCII PLY and ASCII PCD
 share this.
@@ -16,12 +16,9 @@ from numpy.typing import NDArray
 
 from pcdenoise.cloud.scan import Mask, Points
 from pcdenoise.errors import ScanError
+from pcdenoise.io.lines import BLANK, CR, LF, LONGEST_PADDING, QUOTE, Octets, Offsets, is_number, spliced, split_fields
 from pcdenoise.io.source import Column, step_decimals
 
-Octets = NDArray[np.uint8]
-"""Bytes of a file."""
-Offsets = NDArray[np.int64]
-"""Places in Octets."""
 ColumnIndex = int | Offsets
 """Which field of a row: the same in all, or (N,) one for each row (fields after a list shift)."""
 
@@ -30,9 +27,7 @@ _BLOCK_ROWS = 1 << 16
 _LONGEST_NUMBER = 64
 _LONGEST_TEXT = 256
 _COORDINATE_STEP = 1e-6
-_LF, _CR, _BLANK, _QUOTE = 10, 13, 32, 34
-_BLANKS = bytes(32 if byte <= _BLANK and byte != 9 else byte for byte in range(256))
-_PLAIN = np.array([byte in (9, _LF, _CR) or (_BLANK <= byte < 127 and byte != _QUOTE) for byte in range(256)])
+_PLAIN = np.array([byte in (9, LF, CR) or (BLANK <= byte < 127 and byte != QUOTE) for byte in range(256)])
 
 
 @dataclass(frozen=True)
@@ -138,7 +133,7 @@ class TextRows:
     def selected(self, keep: Mask) -> TextRows:
         """The rows kept; the lines of the others go, what stands between rows stays."""
         after = self.ends.copy()
-        for byte in (_CR, _LF):
+        for byte in (CR, LF):
             inside = after < len(self.body)
             after[inside] += self.body[after[inside]] == byte
         removed = np.where(keep, 0, after - self.starts)
@@ -150,7 +145,7 @@ class TextRows:
     def fault(self, row: int, what: str) -> ScanError:
         """An error that names the line of a row."""
         before = self.body[: self.starts[row]]
-        n_lines = int((before == _LF).sum()) or int((before == _CR).sum())
+        n_lines = int((before == LF).sum()) or int((before == CR).sum())
         return ScanError(f"{self.origin}: line {self.first_line + n_lines}: {what}")
 
     def _blocks(self) -> Iterator[tuple[int, int]]:
@@ -191,61 +186,6 @@ class TextRows:
             raise self.fault(first + row, f"'{shown}' is not a number; correct the line or remove it") from None
 
 
-def find_lines(raw: Octets) -> tuple[Offsets, Offsets]:
-    """(L,) start and end, before the line ending, of every line; LF, CR LF, or CR alone."""
-    breaks = np.flatnonzero(raw == _LF)
-    if not len(breaks):
-        breaks = np.flatnonzero(raw == _CR)
-    if len(raw) and (not len(breaks) or breaks[-1] != len(raw) - 1):
-        breaks = np.append(breaks, len(raw))
-    starts = np.concatenate([np.zeros(min(1, len(breaks)), np.int64), breaks[:-1] + 1])
-    ends = breaks - ((breaks > starts) & (raw[np.maximum(breaks - 1, 0)] == _CR) if len(raw) else 0)
-    return starts, ends
-
-
-def first_visible(raw: Octets, starts: Offsets, ends: Offsets) -> Offsets:
-    """(L,) offset of the first byte of each line that is no blank; the line's end for a blank line."""
-    at = starts.copy()
-    open_ = np.flatnonzero(at < ends)
-    while len(open_):
-        open_ = open_[raw[at[open_]] <= _BLANK]
-        at[open_] += 1
-        open_ = open_[at[open_] < ends[open_]]
-    return at
-
-
-def split_fields(line: bytes, delimiter: int | None) -> list[bytes]:
-    """The fields of one line without the blanks and quotes around them; quoted delimiters do not split."""
-    line = line.translate(_BLANKS)
-    if delimiter is None:
-        return [field.strip(b'"') for field in line.split()]
-    parts = line.split(b'"')
-    cut = b'"'.join(part.replace(bytes([delimiter]), b"\n") if i % 2 == 0 else part for i, part in enumerate(parts))
-    return [field.strip(b' \t"') for field in cut.split(b"\n")]
-
-
-def is_number(field: bytes) -> bool:
-    """Whether a field reads as a number, nan and inf included."""
-    try:
-        float(field)
-    except ValueError:
-        return False
-    return b"_" not in field
-
-
-def spliced(raw: Octets, starts: Offsets, lengths: Offsets, new: Octets, new_starts: Offsets, new_lengths: Offsets) -> Octets:
-    """`raw` with each span (ascending, disjoint) replaced by a piece of `new`."""
-    kept_starts = np.concatenate([np.zeros(1, np.int64), starts + lengths])
-    kept_ends = np.append(starts, len(raw))
-    firsts = np.empty(2 * len(starts) + 1, np.int64)
-    sizes = np.empty_like(firsts)
-    firsts[0::2], sizes[0::2] = kept_starts, kept_ends - kept_starts
-    firsts[1::2], sizes[1::2] = new_starts + len(raw), new_lengths
-    places = np.repeat(firsts - (np.cumsum(sizes) - sizes), sizes) + np.arange(int(sizes.sum()))
-    result: Octets = np.concatenate([raw, new])[places]
-    return result
-
-
 @dataclass(frozen=True)
 class _Fields:
     """The fields of a block of rows: row i's are `starts[heads[i]]` onwards, `counts[i]` of them."""
@@ -263,13 +203,13 @@ class _Fields:
         base = int(row_starts[0])
         block = rows.body[base : int(row_ends[-1])]
         if rows.delimiter is None:
-            edges = np.flatnonzero(np.diff(block > _BLANK, prepend=False, append=False)) + base
+            edges = np.flatnonzero(np.diff(block > BLANK, prepend=False, append=False)) + base
             starts, ends = edges[0::2], edges[1::2]
         else:
             places = np.flatnonzero(block == rows.delimiter) + base
             row = np.searchsorted(row_starts, places, side="right") - 1
             places, row = places[places < row_ends[row]], row[places < row_ends[row]]
-            quotes = np.flatnonzero(block == _QUOTE) + base
+            quotes = np.flatnonzero(block == QUOTE) + base
             if len(quotes):
                 n_before = np.searchsorted(quotes, places) - np.searchsorted(quotes, row_starts)[row]
                 places = places[n_before % 2 == 0]
@@ -287,15 +227,16 @@ class _Fields:
                 self.first + int(short[0]), f"has {self.counts[short[0]]} columns, too few; correct the line or remove it"
             )
         starts, ends = self.starts[self.heads + index], self.ends[self.heads + index]
-        while (padding := (starts < ends) & self._is_padding(starts)).any():
-            starts = starts + padding
-        while (padding := (starts < ends) & self._is_padding(ends - 1)).any():
-            ends = ends - padding
+        for _ in range(LONGEST_PADDING):
+            before, after = (starts < ends) & self._is_padding(starts), (starts + 1 < ends) & self._is_padding(ends - 1)
+            if not (before | after).any():
+                break
+            starts, ends = starts + before, ends - after
         return starts, ends
 
     def _is_padding(self, places: Offsets) -> Mask:
         bytes_there = self.rows.body.take(places, mode="clip")
-        padding: Mask = (bytes_there <= _BLANK) | (bytes_there == _QUOTE)
+        padding: Mask = (bytes_there <= BLANK) | (bytes_there == QUOTE)
         return padding
 
 
@@ -310,9 +251,9 @@ def _gathered(body: Octets, starts: Offsets, lengths: Offsets) -> NDArray[np.byt
 def _printed(values: NDArray[Any], form: str) -> tuple[Octets, Offsets]:
     """Values printed one after the other, and the length of each."""
     lines = np.frombuffer((f"{form}\n" * len(values) % tuple(values.tolist())).encode(), np.uint8)
-    breaks = np.flatnonzero(lines == _LF)
+    breaks = np.flatnonzero(lines == LF)
     lengths = np.diff(breaks, prepend=-1) - 1
-    return lines[lines != _LF], lengths
+    return lines[lines != LF], lengths
 
 
 def coordinates(rows: TextRows, column: ColumnIndex, before: Points, after: Column, moved: Mask) -> NewFields:

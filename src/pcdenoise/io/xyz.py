@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import BinaryIO
@@ -10,12 +11,14 @@ import numpy as np
 
 from pcdenoise.cloud.scan import Mask, Points, Scan
 from pcdenoise.errors import ScanError
+from pcdenoise.io.lines import Offsets, find_lines, first_visible, is_number, split_fields
 from pcdenoise.io.source import Column, changed, colours_as_bytes, exactly, moved_rows, portable, step_decimals
 from pcdenoise.io.source import is_number as holds_numbers
-from pcdenoise.io.text import NewFields, Offsets, TextRows, coordinates, find_lines, first_visible, is_number, plain, split_fields
+from pcdenoise.io.text import NewFields, TextRows, coordinates, plain
 
 _DELIMITERS = (ord(";"), ord(","), ord("\t"), None)
 _COMMENTS = (b"#", b"//")
+_UTF16 = (b"\xff\xfe", b"\xfe\xff")
 _BOM = b"\xef\xbb\xbf"
 _NEW_FILE_STEP = 1e-9
 _MOST_TITLES = 1000
@@ -62,7 +65,7 @@ class XyzSource:
 
 def matches(head: bytes) -> bool:
     """Whether the first bytes of a file look like text; other formats are asked first."""
-    return b"\0" not in head
+    return head[:2] in _UTF16 or b"\0" not in head
 
 
 def read(raw: bytes, origin: str) -> Scan:
@@ -90,9 +93,8 @@ def read(raw: bytes, origin: str) -> Scan:
     if n_fields > _MOST_COLUMNS:
         raise ScanError(f"{origin}: line {layout.first_row + 1} has {n_fields} columns, more than any scan; is it a point cloud?")
     names = _unique([*layout.names, *(f"column_{i + 1}" for i in range(len(layout.names), n_fields))][:n_fields])
-    lowered = [name.lower() for name in names]
-    named = {"x", "y", "z"} <= set(lowered)
-    axes = (lowered.index("x"), lowered.index("y"), lowered.index("z")) if named else (0, 1, 2)
+    found = [_axis(name) for name in names]
+    axes = (found.index("x"), found.index("y"), found.index("z")) if {"x", "y", "z"} <= set(found) else (0, 1, 2)
     points, columns = _columns(rows, axes, names)
     indices = {name: names.index(name) for name in columns}
     source = XyzSource(raw[:body_start], rows, axes, points, columns, indices, layout.names_end, layout.count)
@@ -121,7 +123,8 @@ def write(scan: Scan, file: BinaryIO, *, suffix: str = ".xyz") -> None:
         fields.sort(key=lambda change: change.column if isinstance(change.column, int) else 0)
         if source.names_end is not None:
             joint = " " if rows.delimiter is None else chr(rows.delimiter)
-            head = head[: source.names_end] + "".join(joint + name for name in columns).encode() + head[source.names_end :]
+            names = "".join(joint + name.replace(joint, "_") for name in columns)
+            head = head[: source.names_end] + names.encode() + head[source.names_end :]
     else:
         columns = {name: values for name, values in colours_as_bytes(portable(scan.attributes)).items() if holds_numbers(values)}
         head, rows = _created(len(scan), suffix, list(columns))
@@ -176,9 +179,15 @@ def _names(titles: Sequence[tuple[bytes, int]], delimiter: int | None, n_fields:
         for candidate in (delimiter, *_DELIMITERS):
             names = [field.decode("utf-8", "replace") for field in split_fields(line.lstrip(b"#/"), candidate)]
             complete = len(names) == n_fields and not line.startswith(_COMMENTS)
-            if len(names) <= n_fields and (complete or {"x", "y", "z"} <= {name.lower() for name in names}):
+            if len(names) <= n_fields and (complete or {"x", "y", "z"} <= set(map(_axis, names))):
                 return names, end
     return [], None
+
+
+def _axis(name: str) -> str:
+    """x, y or z for a column of that name, a unit in brackets behind it or not; else nothing."""
+    match = re.fullmatch(r"([xyz])\s*([\[(].*)?", name.strip().lower())
+    return match[1] if match else ""
 
 
 def _unique(names: Sequence[str]) -> list[str]:
@@ -194,16 +203,15 @@ def _columns(rows: TextRows, axes: tuple[int, int, int], names: Sequence[str]) -
     """(N, 3) points, and every other column that all rows have: whole numbers as int64, else float64, else text."""
     first = rows.first_fields()
     others = [i for i in range(len(names)) if i not in axes]
+    numeric = [i for i in others if is_number(first[i])]
     try:
-        if not all(is_number(first[i]) for i in others):
-            raise ScanError("a column is text")
-        values = rows.numbers([*axes, *others])
-        columns = {names[i]: _whole(rows, i, found) for i, found in zip(others, values[3:], strict=True)}
-        return np.stack(values[:3], axis=1), columns
-    except ScanError:
-        points = np.stack(rows.numbers(axes), axis=1)
-        n_common = rows.n_fields()
-        return points, {names[i]: _number_or_text(rows, i) for i in others if i < n_common}
+        values = rows.numbers([*axes, *numeric])
+    except ScanError:  # raised again by the next line if it is a coordinate that is wrong
+        values, numeric = rows.numbers(axes), []
+    read = dict(zip(numeric, values[3:], strict=True))
+    n_common = len(first) if len(read) == len(others) else rows.n_fields()
+    columns = {names[i]: _whole(rows, i, read[i]) if i in read else _number_or_text(rows, i) for i in others if i < n_common}
+    return np.stack(values[:3], axis=1), columns
 
 
 def _number_or_text(rows: TextRows, column: int) -> Column:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from itertools import count
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +18,9 @@ from scipy.spatial import cKDTree
 from pcdenoise.cloud.neighbours import spatial_order
 from pcdenoise.cloud.noise_level import estimate
 from pcdenoise.denoising.pyramid import coarsen, share_of_seeds
+from pcdenoise.errors import UsageError
+from pcdenoise.synthesis import noise
+from pcdenoise.synthesis.meshes import MESH_SUFFIXES, load_mesh, sample_mesh
 from pcdenoise.synthesis.shapes import random_surface
 
 Array = NDArray[np.float64]
@@ -25,15 +32,25 @@ N_SEEDS = 6_000
 N_RAW = 48_000
 N_LANDING = 4_000
 """Most seeds, raw points and landing points of one training cloud; larger ones are cut to a ball."""
+_LAWS = {
+    "gaussian": 0.64,
+    "rays": 0.08,
+    "heavy-tailed": 0.1,
+    "laplace": 0.04,
+    "anisotropic": 0.06,
+    "beam-bias": 0.04,
+    "quantised": 0.04,
+}
+"""How often each law of noise is met."""
 
 
 @dataclass(frozen=True)
 class TrainingCloud:
     """One noisy cloud, ready for the network.
 
-    seeds (M, 3), count (M,) or None where every point is its own seed; raw (F, 3): points that land on the seeds, or None then.
+    seeds (M, 3), count (M,); raw (F, 3): points that land on the seeds. Where every point is its own seed, both are None.
     surface (S, 3), normals (S, 3): the true surface. seed_judged (M,): seeds of the surface, far enough from the cut.
-    judged, clutter (F,): final points far enough from the cut, and those that belong to no surface and should stay where they are.
+    judged, clutter (F,): final points far enough from the cut, and those that belong to no surface and should stay.
     noise: estimated standard deviation; scale: what errors are divided by.
     """
 
@@ -48,13 +65,18 @@ class TrainingCloud:
     noise: float
     scale: float
 
+    @property
+    def on_surface(self) -> Mask:
+        """(F,) final points that are judged by their distance to the surface."""
+        return self.judged & ~self.clutter
+
 
 def draw_cloud(surface: Array, normals: Array, neighbours: int, rng: np.random.Generator) -> TrainingCloud:
     """A noisy cloud of random density, noise law and level from the (S, 3) samples of a surface in the unit sphere."""
     n_points = int(np.exp(rng.uniform(np.log(4_000), np.log(150_000))))
     std = 0.0 if rng.random() < 0.04 else float(np.exp(rng.uniform(np.log(0.0015), np.log(0.036))))
     clean, clutter = _with_clutter(surface[_sampling(surface, n_points, rng)], rng)
-    noisy, clutter = _with_outliers(clean + _noise(clean, std, rng), clutter, rng)
+    noisy, clutter = _with_outliers(_noise(clean, std, rng), clutter, rng)
 
     level = estimate(noisy, threads=1)
     share = share_of_seeds(level, neighbours) * float(np.exp(0.15 * rng.standard_normal()))
@@ -74,46 +96,38 @@ def draw_cloud(surface: Array, normals: Array, neighbours: int, rng: np.random.G
         return judged
 
     truth = surface[near], normals[near]
-    noise = level.std * float(np.exp(0.1 * rng.standard_normal()))
-    scale = max(std, 0.05 * level.spacing, 1e-6)
+    estimated = level.std * float(np.exp(0.1 * rng.standard_normal()))
+    scale = max(std, 0.1 * level.spacing, 1e-6)
     if share == 1:
         judged = inside(noisy)
-        return TrainingCloud(noisy, None, None, *truth, judged & ~clutter, judged, clutter, noise, scale)
+        return TrainingCloud(noisy, None, None, *truth, judged & ~clutter, judged, clutter, estimated, scale)
     seeds = coarsen(noisy, share, seed=int(rng.integers(2**31)), threads=1)
     seed_judged = inside(seeds.points)
     if clutter.any():
         seed_judged &= cKDTree(noisy[clutter]).query(seeds.points)[0] > 2 * level.spacing
     landing = np.sort(rng.permutation(np.flatnonzero(inside(noisy)))[:N_LANDING])
     judged = np.ones(len(landing), dtype=bool)
-    return TrainingCloud(seeds.points, seeds.count, noisy[landing], *truth, seed_judged, judged, clutter[landing], noise, scale)
+    return TrainingCloud(
+        seeds.points, seeds.count, noisy[landing], *truth, seed_judged, judged, clutter[landing], estimated, scale
+    )
 
 
 def _sampling(surface: Array, n_points: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Rows of the surface samples: uniform, or with a density that varies smoothly up to tenfold."""
-    n = len(surface)
     if rng.random() < 0.65:
-        return rng.choice(n, size=min(n_points, n), replace=False)
-    direction = rng.standard_normal(3)
-    wave = np.sin(surface @ direction * rng.uniform(0.5, 4) + rng.uniform(0, 6.3))
-    weight = np.exp(rng.uniform(0.3, 1.2) * wave)
-    return rng.choice(n, size=min(n_points, n // 2), replace=False, p=weight / weight.sum())
+        return rng.choice(len(surface), size=n_points, replace=False)
+    kept = noise.thin(surface, rng, contrast=rng.uniform(2, 10))
+    return rng.choice(kept, size=min(n_points, len(kept)), replace=False)
 
 
 def _noise(clean: Array, std: float, rng: np.random.Generator) -> Array:
-    """Gaussian mostly; at times along one view direction, with heavy tails, or of a level that varies over the cloud."""
-    law = rng.random()
-    noise = std * rng.standard_normal(clean.shape)
-    if law < 0.65:
-        return noise
-    if law < 0.77:
-        view = rng.standard_normal(3) * 3
-        ray = clean - view
-        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-        return 0.3 * noise + std * rng.standard_normal((len(clean), 1)) * ray
-    if law < 0.89:
-        return noise / np.sqrt(rng.chisquare(5, (len(clean), 1)) / 5) * np.sqrt(3 / 5)
-    wave = np.sin(clean @ rng.standard_normal(3) * rng.uniform(0.5, 3) + rng.uniform(0, 6.3))
-    return noise * np.exp(0.4 * wave)[:, None]
+    """Noisy points: the same normal law everywhere at most times, a level that varies over the cloud or another law at others."""
+    if rng.random() < 0.15:
+        wave = np.sin(clean @ rng.standard_normal(3) * rng.uniform(0.5, 3) + rng.uniform(0, 6.3))
+        varied: Array = clean + (noise.gaussian(clean, std, rng) - clean) * np.exp(0.4 * wave)[:, None]
+        return varied
+    law = rng.choice(list(_LAWS), p=list(_LAWS.values()))
+    return noise.NOISES[law](clean, std, rng)
 
 
 def _with_clutter(clean: Array, rng: np.random.Generator) -> tuple[Array, Mask]:
@@ -143,42 +157,79 @@ def _with_outliers(noisy: Array, clutter: Mask, rng: np.random.Generator) -> tup
     """At times up to 2 % gross errors; they count as clutter."""
     if rng.random() > 0.2:
         return noisy, clutter
-    n = int(len(noisy) * rng.uniform(0.001, 0.02)) + 1
-    gross = noisy[rng.integers(len(noisy), size=n)] + rng.standard_normal((n, 3)) * rng.uniform(0.02, 0.3)
-    return np.concatenate([noisy, gross]), np.concatenate([clutter, np.ones(n, dtype=bool)])
+    result, wrong = noise.outliers(noisy, rng.uniform(0.001, 0.02), rng, reach=rng.uniform(0.01, 0.1))
+    return result, clutter | wrong
 
 
-class SurfacePool:
-    """Procedural surfaces sampled once and kept as files, since sampling one costs more than learning from it."""
+Surfaces = list[Callable[[], tuple[Array, Array]]]
+"""Training surfaces, each a function that gives (S, 3) points and (S, 3) unit normals in the unit sphere."""
 
-    def __init__(self, folder: Path, n_surfaces: int, seed: int) -> None:
-        self.folder, self.n_surfaces, self.seed = folder, n_surfaces, seed
-        folder.mkdir(parents=True, exist_ok=True)
 
-    def surface(self, number: int) -> tuple[Array, Array]:
-        """(S, 3) points and (S, 3) normals of one surface."""
-        path = self.folder / f"{self.seed}_{number}.npy"
-        if not path.exists():
-            sample = random_surface(np.random.default_rng([self.seed, number]), N_DENSE)
-            part = path.with_suffix(".part.npy")
-            np.save(part, np.concatenate([sample.points, sample.normals], axis=1).astype(np.float32))
-            part.replace(path)
-        both = np.load(path).astype(np.float64)
-        return both[:, :3], both[:, 3:]
+def surfaces_from(data: list[Path] | None, n_procedural: int, seed: int, cache: Path) -> Surfaces:
+    """Procedural surfaces, or every mesh among the files in `data` (folders are searched). Raises UsageError when there is none.
+
+    Samples are kept in the folder `cache`, since sampling a surface costs more than learning from it.
+    """
+    if data is None:
+        return [partial(_cached, cache / f"{n}.npy", partial(_procedural, seed, n)) for n in range(n_procedural)]
+    meshes = [file for path in data for file in (sorted(path.rglob("*")) if path.is_dir() else [path])]
+    meshes = [file for file in meshes if _is_mesh(file)]
+    if not meshes:
+        raise UsageError(
+            f"{', '.join(map(str, data))}: no mesh to learn from; give a folder of meshes, or one made by pcdenoise synth"
+        )
+    return [partial(_cached, cache / f"{n}.npy", partial(_from_mesh, file)) for n, file in enumerate(meshes)]
+
+
+def _is_mesh(path: Path) -> bool:
+    """By suffix; a PLY may as well be a point cloud and must say that it has faces."""
+    if path.suffix.lower() != ".ply":
+        return path.suffix.lower() in MESH_SUFFIXES
+    with path.open("rb") as file:
+        return b"element face" in file.read(8192)
+
+
+def _cached(path: Path, sample: Callable[[], tuple[Array, Array]]) -> tuple[Array, Array]:
+    if not path.exists():
+        part = path.with_suffix(".part.npy")
+        np.save(part, np.concatenate(sample(), axis=1).astype(np.float32))
+        part.replace(path)
+    both = np.load(path).astype(np.float64)
+    return both[:, :3], both[:, 3:]
+
+
+def _procedural(seed: int, number: int) -> tuple[Array, Array]:
+    sample = random_surface(np.random.default_rng([seed, number]), N_DENSE)
+    return sample.points, sample.normals
+
+
+def _from_mesh(path: Path) -> tuple[Array, Array]:
+    sample = sample_mesh(load_mesh(path), N_DENSE, np.random.default_rng(0))
+    middle = (sample.points.max(axis=0) + sample.points.min(axis=0)) / 2
+    points = sample.points - middle
+    return points / np.linalg.norm(points, axis=1).max(), sample.normals
+
+
+class CloudSource:
+    """An endless series of training clouds over some surfaces; the n-th depends on seed and n alone."""
+
+    def __init__(self, surfaces: Surfaces, seed: int) -> None:
+        self.surfaces, self.seed = surfaces, seed
 
     def cloud(self, number: int, neighbours: int) -> TrainingCloud:
-        """The number-th training cloud of an endless series."""
+        """The number-th cloud: one of the surfaces, turned at random, with its own density and noise."""
         rng = np.random.default_rng([self.seed, 7, number])
-        surface, normals = self.surface(int(rng.integers(self.n_surfaces)))
+        surface, normals = self.surfaces[int(rng.integers(len(self.surfaces)))]()
         turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
         return draw_cloud(surface @ turn, normals @ turn, neighbours, rng)
 
     def clouds(self, first: int, neighbours: int, ahead: int = 6) -> Iterator[TrainingCloud]:
-        """Endless clouds, made ahead of time by one other process."""
-        with ProcessPoolExecutor(1) as makers:
-            waiting: list[Future[TrainingCloud]] = [makers.submit(self.cloud, first + i, neighbours) for i in range(ahead)]
-            number = first + ahead
-            while True:
-                yield waiting.pop(0).result()
-                waiting.append(makers.submit(self.cloud, number, neighbours))
-                number += 1
+        """Endless clouds from the first-th on, made ahead of time by one other process."""
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as makers:
+            waiting = deque(makers.submit(self.cloud, first + i, neighbours) for i in range(ahead))
+            try:
+                for number in count(first + ahead):
+                    yield waiting.popleft().result()
+                    waiting.append(makers.submit(self.cloud, number, neighbours))
+            finally:
+                makers.shutdown(cancel_futures=True)

@@ -30,18 +30,18 @@ class ProjectionConfig:
 class Edges(NamedTuple):
     """M points that look at K sources each; everything is relative to the point, in units of its `scale`.
 
-    offset (M, K, 3) source minus point; index (M, K) rows of the sources; weight (M, K) kernel times the number of raw points
+    offset (M, K, 3) source minus point; source (M, K) their rows; weight (M, K) kernel times the number of raw points
     behind a source, zero at the last neighbour and of sum one; scale (M, 1) length unit in local units.
     """
 
     offset: Tensor
-    index: Tensor
+    source: Tensor
     weight: Tensor
     scale: Tensor
 
 
 class Planes(NamedTuple):
-    """A tangent plane for each of M points: normal (M, 3), of either sign, and shape (M, 3): square roots of the covariance's eigenvalues."""
+    """Tangent planes of M points: normal (M, 3), of either sign; shape (M, 3): standard deviations along the main axes."""
 
     normal: Tensor
     shape: Tensor
@@ -78,7 +78,7 @@ def planes(graph: Edges) -> Planes:
 
 
 def smallest_eigenvector(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Ascending eigenvalues (M, 3) and the unit eigenvector (M, 3) of the smallest, for symmetric (M, 3, 3) float64, in closed form.
+    """Ascending eigenvalues (M, 3) and the unit eigenvector (M, 3) of the smallest, of symmetric (M, 3, 3) float64, closed form.
 
     Trigonometric solution of the characteristic cubic (Smith 1961); the vector is the longest cross product of two rows of
     (A - λI). Where two eigenvalues coincide any vector of their plane is right.
@@ -103,7 +103,7 @@ def smallest_eigenvector(matrix: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def point_features(graph: Edges, plane: Planes, noise: float) -> Tensor:
-    """(M, 4) what a point knows of its surroundings: thickness, narrowness and noise in units of its scale, and whether the noise explains the thickness."""
+    """(M, 4) what a point knows of its surroundings: thickness, narrowness, noise in its scale, noise explaining thickness."""
     thin, middle, wide = plane.shape.unbind(-1)
     level = noise / graph.scale[:, 0]
     return torch.stack([2 * thin, 2 * (wide - middle), 4 * level / (1 + level), thin / (thin + level + 1e-6)], dim=-1)
@@ -115,7 +115,7 @@ def edge_features(graph: Edges, own: Planes, theirs: Planes, noise: float) -> tu
     a: height of the neighbour over my plane; b: height of the neighbour's plane over me. All features keep their value when
     the cloud is rotated or mirrored and when any normal changes its sign.
     """
-    normal = theirs.normal[graph.index]
+    normal = theirs.normal[graph.source]
     a = (graph.offset @ own.normal[:, :, None]).squeeze(-1)
     b = (graph.offset * normal).sum(-1)
     cosine = (normal @ own.normal[:, :, None]).squeeze(-1)
@@ -138,7 +138,7 @@ def edge_features(graph: Edges, own: Planes, theirs: Planes, noise: float) -> tu
 
 
 class MessageRound(nn.Module):
-    """One exchange between points and their sources, m = MLP(e, h_i, h_j); `head` turns messages into steps, else into features."""
+    """One exchange between points and their sources: m = MLP(e, h_i, h_j) on every edge, pooled into the points' features."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -151,11 +151,12 @@ class MessageRound(nn.Module):
 
     def hear(self, their: Tensor) -> Tensor:
         """(N, C) what all sources say, from their features (N, C); done once, not once per edge."""
-        return self.their(their)
+        said: Tensor = self.their(their)
+        return said
 
     def forward(self, features: Tensor, graph: Edges, own: Tensor, heard: Tensor) -> tuple[Tensor, Tensor]:
         """Messages (M, K, C) and the points' new features (M, C). features (M, K, 8), own (M, C), heard (N, C)."""
-        hidden = torch.relu(self.edge(features) + self.own(own)[:, None] + heard[graph.index])
+        hidden = torch.relu(self.edge(features) + self.own(own)[:, None] + heard[graph.source])
         message = torch.relu(self.message(hidden))
         mean = (graph.weight[:, None] @ message).squeeze(1)
         most = (message * (graph.weight / graph.weight.amax(-1, keepdim=True).clamp_min(1e-12))[:, :, None]).amax(1)
@@ -182,9 +183,10 @@ class Step(nn.Module):
         sharpness, pull, lift = self.head(message).unbind(-1)
         weight = graph.weight * torch.exp(4 * torch.tanh(sharpness / 4))
         weight = weight / weight.sum(-1, keepdim=True).clamp_min(1e-12)
-        pulled = ((weight * (0.5 + pull) * b)[:, None] @ theirs.normal[graph.index]).squeeze(1)
+        pulled = ((weight * (0.5 + pull) * b)[:, None] @ theirs.normal[graph.source]).squeeze(1)
         lifted = (weight * (0.5 + lift) * a).sum(-1, keepdim=True) * own.normal
-        return graph.scale * (pulled + lifted)
+        move: Tensor = graph.scale * (pulled + lifted)
+        return move
 
 
 class Stage(nn.Module):
@@ -196,6 +198,11 @@ class Stage(nn.Module):
         self.rounds = nn.ModuleList(MessageRound(channels) for _ in range(rounds))
         self.step = Step(channels)
 
+    @property
+    def exchanges(self) -> list[MessageRound]:
+        """The rounds, in order."""
+        return [layer for layer in self.rounds if isinstance(layer, MessageRound)]
+
 
 class ProjectionNetwork(nn.Module):
     """Stages among the seeds, then one `landing` of all points on the seeds' surface. `denoising.pyramid` runs them."""
@@ -205,3 +212,8 @@ class ProjectionNetwork(nn.Module):
         self.config = config
         self.stages = nn.ModuleList(Stage(config.channels, rounds) for rounds in config.rounds)
         self.landing = Stage(config.channels, config.landing_rounds)
+
+    @property
+    def among(self) -> list[Stage]:
+        """The stages in which seeds look at each other, in order."""
+        return [stage for stage in self.stages if isinstance(stage, Stage)]

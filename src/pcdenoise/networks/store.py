@@ -1,8 +1,8 @@
 """Model folders: weights (safetensors), config and card. Nothing is unpickled and no code comes from a file.
 
-    NAME/weights.safetensors   tensors, float32
-    NAME/config.json           {"network": …, "settings": {…}, "training": {…}, "scores": {…}}
-    NAME/README.md             the card: data, noise, seed, command, scores
+NAME/weights.safetensors   tensors, float32
+NAME/config.json           {"network": …, "settings": {…}, "training": {…}, "scores": {…}}
+NAME/README.md             the card: data, noise, seed, command, scores
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def info(folder: Path) -> ModelInfo:
 
 
 def load(name_or_folder: str | Path = DEFAULT) -> Model:
-    """The model of that name among the shipped ones, or in that folder. Raises ModelError when missing, damaged or tampered with."""
+    """The model in that folder, or of that name among the shipped ones. Raises ModelError when missing, damaged or tampered."""
     folder = _find(name_or_folder)
     config = _read_config(folder)
     network = _build(config)
@@ -112,7 +112,9 @@ def load(name_or_folder: str | Path = DEFAULT) -> Model:
     return Model(folder.name, network.eval(), config, hashlib.sha256(data).hexdigest())
 
 
-def save(network: ProjectionNetwork, folder: Path, *, summary: str, training: Mapping[str, Any], scores: Mapping[str, Any], card: str) -> None:
+def save(
+    network: ProjectionNetwork, folder: Path, *, summary: str, training: Mapping[str, Any], scores: Mapping[str, Any], card: str
+) -> None:
     """Writes a model folder; every file appears whole or not at all."""
     from safetensors.torch import save as serialise
 
