@@ -28,8 +28,9 @@ lint: .venv/dev.stamp ## ruff (style and bugs) and import-linter (the layers)
 types: .venv/dev.stamp ## mypy --strict
 	$(BIN)/mypy
 
-docs: .venv/dev.stamp ## run every command of README and docs/, and rebuild the command reference
+docs: .venv/dev.stamp demo ## rebuild the command reference and the README's picture, and run every command of README and docs/
 	$(BIN)/python docs/reference.py
+	cp demo/before_after.png docs/images/
 	$(BIN)/python -m pytest tests/test_docs.py
 
 bench: .venv/run.stamp ## the shipped model and a classical filter on shapes whose surface is known

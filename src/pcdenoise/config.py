@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -19,10 +19,10 @@ class DenoiseConfig(Settings):
     """How a scan is cleaned."""
 
     method: Method = Field("network", description="How points are moved: the learned network, or a classical filter.")
-    iters: int | Literal["auto"] = Field(1, description="Passes over the scan; auto stops by itself, without ground truth.")
+    iters: Annotated[int, Field(ge=1, le=100)] | Literal["auto"] = Field(1, description="Passes over the scan; auto stops by itself, without ground truth.")
     strength: float = Field(1.0, ge=0, le=1, description="Share of the move that is carried out.")
     max_move: float | None = Field(None, gt=0, description="Longest move of any point, in the scan's unit.")
-    relax_steps: int = Field(8, ge=0, le=100, description="Steps toward even spacing, within the noise; 0 for none.")
+    relax_steps: int = Field(4, ge=0, le=100, description="Steps toward even spacing, within the noise; 0 for none.")
     outliers: Literal["keep", "flag", "remove"] = Field("keep", description="What becomes of isolated points.")
     neighbours: int = Field(24, ge=6, le=1024, description="Neighbours of a classical filter.")
     seed: int = Field(0, ge=0, description="Seed of every random choice.")

@@ -23,7 +23,7 @@ def spatial_order(points: Points) -> Indices:
         return np.zeros(0, dtype=np.int64)
     low = points.min(axis=0)
     extent = float((points.max(axis=0) - low).max())
-    cells = ((points - low) * ((2**_BITS - 1) / extent if extent > 0 else 0.0)).astype(np.uint64)
+    cells = ((points - low) / (extent or 1.0) * (2**_BITS - 1)).astype(np.uint64)
     code = _spread_bits(cells[:, 0]) << np.uint64(2) | _spread_bits(cells[:, 1]) << np.uint64(1) | _spread_bits(cells[:, 2])
     order: Indices = np.argsort(code, kind="stable")
     return order

@@ -20,6 +20,8 @@ _SURFACE_ASPECT = 3.8
 
 A ball that is filled with noise has 2.3 to 2.9 at any size, a disc of radius R under noise std has R / std.
 """
+_CERTAIN_ASPECT = 4.4
+"""Only a surface reaches so much on some rung: a solid ball, cube or blob has up to 4.3, once a neighbourhood is half of it."""
 _CLEARER_SHARE = 0.3  # this share of all places must show it: edges and thin parts stay thick at any scale
 _SCALE_STDS = 4.5  # the radius of the neighbourhood of `scale_points`
 
@@ -68,7 +70,8 @@ def estimate(points: Points, seed: int = 0, threads: int = -1) -> NoiseLevel:
     if not shown:
         return NoiseLevel(max(rungs, key=lambda rung: rung.aspect).std, spacing, float(_LADDER[0]), False)
     std = shown[0].std
-    return NoiseLevel(std, spacing, _points_within(_SCALE_STDS * std, rungs), True)
+    certain = max(rung.aspect for rung in shown) >= _CERTAIN_ASPECT
+    return NoiseLevel(std, spacing, _points_within(_SCALE_STDS * std, rungs), certain)
 
 
 def _points_within(radius: float, rungs: list[_Rung]) -> float:

@@ -133,6 +133,8 @@ class _Cleaning:
         scan = io.read(job.source, format=format_of(job.source, self.format))
         with self.console.progress(job.source.name) as on_progress:
             result = denoiser.denoise(scan.points, self.model, self.config, on_progress)
+        for step in result.steps:
+            self.console.detail(", ".join(f"{name.replace('_', ' ')} {figure(value)}" for name, value in step.figures.items()))
         job.target.parent.mkdir(parents=True, exist_ok=True)
         io.write(
             self._marked(scan, result), job.target, format=format_of(job.target, self.format), overwrite=self.overwrite,
@@ -142,10 +144,10 @@ class _Cleaning:
         if picture := self.pictures.get(job.source):
             outputs.save_before_after(picture, scan, result.points, notes=_notes(result), overwrite=self.overwrite)
         self.pages[:] = [Page(scan.points, result.points, colours=outputs.colours(scan))]
-        step = coordinate_step(scan)
-        if step and 0 < figures["move_median"] < step / 2:
+        grid = coordinate_step(scan)
+        if grid and 0 < figures["move_median"] < grid / 2:
             self.console.note(
-                f"{job.target}: most moves are below the file's step of {step:g} and vanish; write .ply to keep them"
+                f"{job.target}: most moves are below the file's step of {grid:g} and vanish; write .ply to keep them"
             )
         self.console.note(f"{job.target}: {_summary(figures)}" + (f"; picture {picture}" if picture else ""))
         return figures

@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 
 from pcdenoise.commands import options
 from pcdenoise.commands.console import Console
-from pcdenoise.commands.files import expand
+from pcdenoise.commands.files import refuse_existing
 from pcdenoise.commands.options import configured, option
-from pcdenoise.errors import UsageError
+from pcdenoise.errors import ScanError, UsageError
 
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
@@ -23,7 +23,7 @@ def train(
             "--data",
             metavar="DIR",
             envvar="PCDENOISE_TRAIN_DATA",
-            help="Clean scans or a synth folder; endless shapes if not given.",
+            help="Meshes, folders of meshes, synth folders; endless procedural shapes if not given.",
         ),
     ] = None,
     method: Annotated[Literal["supervised"], option("--method", help="What the model learns from.")] = "supervised",
@@ -32,11 +32,11 @@ def train(
     budget: Annotated[str | None, option("--budget", metavar="TIME", help="Stop after so long: 90s, 20m, 1.5h.")] = None,
     init: Annotated[str | None, option("--init", metavar="NAME|DIR", help="Start from this model.")] = None,
     resume: Annotated[bool, option("--resume", help="Go on where an interrupted run in the same folder stopped.")] = False,
+    overwrite: options.Overwrite = False,
     config: options.Config = None,
-    seed: options.Seed = 0,
+    seed: options.Seed = 1,
     threads: options.Threads = None,
     quiet: options.Quiet = False,
-    verbose: options.Verbose = False,
 ) -> None:
     """Train a model. Ctrl-C keeps what was learned so far.
 
@@ -48,12 +48,21 @@ def train(
     settings = configured(
         TrainConfig, method=method, network=network, steps=steps, budget_s=_seconds(budget), seed=seed, threads=threads
     )
-    console = Console(quiet, verbose)
+    refuse_existing([output / "config.json"], overwrite or resume)
+    console = Console(quiet)
     with console.progress("train") as on_progress:
         summary = trainer.train(
-            expand(data) if data else None, settings, output, init=init, resume=resume, on_progress=on_progress
+            _existing(data) if data else None, settings, output, init=init, resume=resume, on_progress=on_progress
         )
     console.note(f"{output}: {summary}")
+
+
+def _existing(names: list[str]) -> list[Path]:
+    paths = [Path(name) for name in names]
+    for path in paths:
+        if not path.exists():
+            raise ScanError(f"{path}: no such file or folder; check --data")
+    return paths
 
 
 def _seconds(text: str | None) -> float | None:

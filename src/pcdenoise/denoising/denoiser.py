@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,13 +19,15 @@ from pcdenoise.cloud.noise_level import NoiseLevel, estimate
 from pcdenoise.cloud.scan import Mask, Points
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import classical
-from pcdenoise.denoising.relaxation import relax
+from pcdenoise.denoising.relaxation import relax, within
 from pcdenoise.errors import ModelError, UsageError
 from pcdenoise.networks.store import Model
 
 FEWEST_POINTS = 16
 """Smaller clouds come back as they were: no surface can be told from them."""
 _MOST_PASSES = 10
+_FURTHEST_STDS = 5.0
+"""Longest move of one pass along the normal: what is further from the surface is no noise but an outlier or another thing."""
 _WORTHWHILE = 0.75
 """`auto` goes on while a pass leaves less than this share of the noise that it found."""
 
@@ -54,8 +57,8 @@ class Result:
 def denoise(points: Points, model: Model | None, config: DenoiseConfig, on_progress: Progress | None = None) -> Result:
     """Moves (N, 3) float64 points onto the surface they were measured on; row i stays row i.
 
-    Rows that are not finite stay as they are; exact duplicates move together. Raises UsageError when the network is asked
-    for without a model.
+    Rows that are not finite stay as they are; exact duplicates move together; the network leaves a cloud in which no scale
+    shows a surface as it is. Raises UsageError when the network is asked for without a model.
     """
     cloud = _Cloud(points, config)
     found = np.zeros(len(points), dtype=bool)
@@ -126,22 +129,20 @@ class _Cloud:
 
     def limited(self, moved: Points) -> Points:
         """Moves scaled by the strength and cut to the longest that is allowed."""
-        move = self.config.strength * (moved - self.start)
-        if self.config.max_move is not None:
-            length = np.linalg.norm(move, axis=1, keepdims=True)
-            move *= np.minimum(1, self.config.max_move / np.maximum(length, 1e-300))
-        return self.start + move
+        blended = self.start + self.config.strength * (moved - self.start)
+        return blended if self.config.max_move is None else within(self.config.max_move, self.start, blended)
 
 
 def _passes(cloud: _Cloud, model: Model | None, config: DenoiseConfig, on_progress: Progress) -> Iterator[Step]:
-    if len(cloud.start) < FEWEST_POINTS or config.strength == 0:
+    no_surface = config.method == "network" and not cloud.level.is_surface
+    if len(cloud.start) < FEWEST_POINTS or config.strength == 0 or no_surface:
         return
     auto = config.iters == "auto"
     n_passes = _MOST_PASSES if config.iters == "auto" else config.iters
     points, level = cloud.start, cloud.level
     for number in range(1, n_passes + 1):
         task = f"pass {number}" if auto or n_passes > 1 else "cleaning"
-        moved = _one_pass(points, level, model, config, cloud.threads, lambda share, task=task: on_progress(task, share))
+        moved = _one_pass(points, level, model, config, cloud.threads, partial(on_progress, task))
         after = estimate(moved, config.seed, cloud.threads)
         length = np.linalg.norm(moved - points, axis=1)
         figures = {
@@ -169,7 +170,7 @@ def _one_pass(
     if model is None:
         raise UsageError("--method network needs a model; give --model, or choose --method jet")
     moved = _network_pass(points, level, model, config.seed, threads, on_share)
-    return relax(moved, level.std, config.relax_steps, threads)
+    return relax(within(_FURTHEST_STDS * level.std, points, moved), level.std, config.relax_steps, threads)
 
 
 def _network_pass(

@@ -17,14 +17,24 @@ from torch import Tensor
 from pcdenoise.cloud.neighbours import Indices, NeighbourSearch, coordinate_hash
 from pcdenoise.cloud.noise_level import NoiseLevel
 from pcdenoise.cloud.scan import Points
-from pcdenoise.networks.projection import Edges, Planes, ProjectionNetwork, Stage, edge_features, edges, planes, point_features
+from pcdenoise.networks.projection import (
+    Edges,
+    Planes,
+    ProjectionNetwork,
+    Stage,
+    edge_features,
+    edges,
+    joined,
+    planes,
+    point_features,
+)
 
 _APART = {1: 0.52, 2: 0.39, 3: 0.31, 5: 0.23}
 """Share of candidates that remain when none may be among the so many nearest of another (measured)."""
 _LANDSCAPE = 11.0
 """Neighbourhoods hold 11·√(points that show the surface) raw points: the balance of noise, which asks for all of them, and of
 curvature, which asks for few (measured on shapes that serve for nothing else)."""
-BLOCK_POINTS = 4096
+BLOCK_POINTS = 2048
 
 
 @dataclass(frozen=True)
@@ -112,8 +122,7 @@ def descend(
     stages: list[Tensor] = []
     for stage in network.among:
         looking = _Looking(points, points, weights, k, noise, block_points, threads)
-        own = looking.planes()
-        known = looking.embed(stage, own)
+        own, known = looking.around(stage)
         features = known if features is None else features + known
         move, features = looking.messages(stage, own, own, features, features, on_block)
         points = points + move.double()
@@ -123,8 +132,8 @@ def descend(
     seed_planes = _Looking(points, points, weights, k, noise, block_points, threads).planes()
     landing = torch.from_numpy(raw)
     looking = _Looking(landing, points, weights, k, noise, block_points, threads)
-    own = looking.planes()
-    move, _ = looking.messages(network.landing, own, seed_planes, looking.embed(network.landing, own), features, on_block)
+    own, known = looking.around(network.landing)
+    move, _ = looking.messages(network.landing, own, seed_planes, known, features, on_block)
     return Descent(stages, landing + move.double())
 
 
@@ -151,12 +160,15 @@ class _Looking:
 
     def planes(self) -> Planes:
         """Tangent planes of all points."""
-        parts = [planes(graph) for _, graph in self.graphs()]
-        return Planes(torch.cat([p.normal for p in parts]), torch.cat([p.shape for p in parts]))
+        return joined([planes(graph) for _, graph in self.graphs()])
 
-    def embed(self, stage: Stage, own: Planes) -> Tensor:
-        """(M, C) first features of all points."""
-        return torch.cat([stage.embed(point_features(graph, own.block(block), self.noise)) for block, graph in self.graphs()])
+    def around(self, stage: Stage) -> tuple[Planes, Tensor]:
+        """Tangent planes and first features (M, C) of all points."""
+        found, known = [], []
+        for _, graph in self.graphs():
+            found.append(planes(graph))
+            known.append(stage.embed(point_features(graph, found[-1], self.noise)))
+        return joined(found), torch.cat(known)
 
     def messages(
         self, stage: Stage, own: Planes, theirs: Planes, features: Tensor, sources: Tensor, on_block: Callable[[int], None]

@@ -74,3 +74,12 @@ def spliced(raw: Octets, starts: Offsets, lengths: Offsets, new: Octets, new_sta
     places = np.repeat(firsts - (np.cumsum(sizes) - sizes), sizes) + np.arange(int(sizes.sum()))
     result: Octets = np.concatenate([raw, new])[places]
     return result
+
+
+def without(raw: Octets, starts: Offsets, lengths: Offsets) -> Octets:
+    """`raw` without spans that do not overlap."""
+    steps = np.zeros(len(raw) + 1, np.int8)
+    steps[starts] += 1
+    steps[starts + lengths] -= 1
+    kept: Octets = raw[np.cumsum(steps[:-1], dtype=np.int8) == 0]
+    return kept

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pcdenoise.cloud.scan import Mask, Points
 from pcdenoise.errors import ScanError
-from pcdenoise.io.lines import Octets, Offsets, spliced
+from pcdenoise.io.lines import Octets, Offsets, spliced, without
 from pcdenoise.io.source import Column, exactly, moved_rows
 from pcdenoise.io.text import ColumnIndex, TextRows, coordinates, plain
 
@@ -93,8 +93,7 @@ class ListRecords:
 
     def selected(self, keep: Mask) -> bytes:
         starts = np.concatenate([np.zeros(1, np.int64), self.ends])[: len(self.ends)]
-        nothing = np.zeros(len(keep) - int(keep.sum()), np.int64)
-        return spliced(self.body, starts[~keep], (self.ends - starts)[~keep], self.body[:0], nothing, nothing).tobytes()
+        return without(self.body, starts[~keep], (self.ends - starts)[~keep]).tobytes()
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pcdenoise.cloud.scan import Mask, Points
 from pcdenoise.errors import ScanError
-from pcdenoise.io.lines import BLANK, CR, LF, LONGEST_PADDING, QUOTE, Octets, Offsets, is_number, spliced, split_fields
+from pcdenoise.io.lines import BLANK, CR, LF, LONGEST_PADDING, QUOTE, Octets, Offsets, is_number, spliced, split_fields, without
 from pcdenoise.io.source import Column, step_decimals
 
 ColumnIndex = int | Offsets
@@ -100,35 +100,36 @@ class TextRows:
 
     def rewritten(self, changes: Sequence[NewFields]) -> Iterator[bytes]:
         """The body with fields replaced and appended, in pieces; changes ordered by column, appended ones last."""
-        joint = "" if self.delimiter is None else chr(self.delimiter)
         at = 0
         for first, last in self._blocks() if changes else ():
-            fields = _Fields.of(self, first, last)
-            n = last - first
-            starts, lengths, used = (np.empty((n, len(changes)), dtype) for dtype in (np.int64, np.int64, np.bool_))
-            buffers, sizes = [], np.zeros((n, len(changes)), np.int64)
-            for k, change in enumerate(changes):
-                used[:, k] = True if change.rows is None else change.rows[first:last]
-                chosen = used[:, k]
-                if change.column is None:
-                    starts[:, k], lengths[:, k] = self.ends[first:last], 0
-                else:
-                    begin, end = fields.spans(change.column)
-                    starts[:, k], lengths[:, k] = begin, end - begin
-                form = change.form if change.column is not None else (joint or " ") + change.form
-                buffer, sizes[chosen, k] = _printed(change.values[first:last][chosen], form)
-                buffers.append(buffer)
             stop = int(self.ends[last - 1])
-            firsts = np.zeros_like(sizes)
-            total = 0
-            for k, buffer in enumerate(buffers):
-                firsts[:, k] = total + np.cumsum(sizes[:, k]) - sizes[:, k]
-                total += len(buffer)
-            yield spliced(
-                self.body[at:stop], starts[used] - at, lengths[used], np.concatenate(buffers), firsts[used], sizes[used]
-            ).tobytes()
+            yield self._rewritten_block(changes, first, last, at, stop).tobytes()
             at = stop
         yield self.body[at:].tobytes()
+
+    def _rewritten_block(self, changes: Sequence[NewFields], first: int, last: int, at: int, stop: int) -> Octets:
+        """Bytes `at` to `stop` of the body, which end with row `last`, with the fields of rows `first` to `last` changed."""
+        fields = _Fields.of(self, first, last)
+        joint = " " if self.delimiter is None else chr(self.delimiter)
+        starts, lengths, new_starts, new_lengths = np.zeros((4, last - first, len(changes)), np.int64)
+        used = np.ones((last - first, len(changes)), np.bool_)
+        printed = [np.empty(0, np.uint8)]
+        for k, change in enumerate(changes):
+            chosen = used[:, k]
+            if change.rows is not None:
+                chosen[:] = change.rows[first:last]
+            if change.column is None:
+                starts[:, k] = self.ends[first:last]
+            else:
+                starts[:, k], ends = fields.spans(change.column)
+                lengths[:, k] = ends - starts[:, k]
+            form = joint + change.form if change.column is None else change.form
+            octets, sizes = _printed(change.values[first:last][chosen], form)
+            new_lengths[chosen, k] = sizes
+            new_starts[chosen, k] = sum(map(len, printed)) + np.cumsum(sizes) - sizes
+            printed.append(octets)
+        new = np.concatenate(printed)
+        return spliced(self.body[at:stop], starts[used] - at, lengths[used], new, new_starts[used], new_lengths[used])
 
     def selected(self, keep: Mask) -> TextRows:
         """The rows kept; the lines of the others go, what stands between rows stays."""
@@ -137,8 +138,7 @@ class TextRows:
             inside = after < len(self.body)
             after[inside] += self.body[after[inside]] == byte
         removed = np.where(keep, 0, after - self.starts)
-        nothing = np.zeros(len(self) - int(keep.sum()), np.int64)
-        body = spliced(self.body, self.starts[~keep], removed[~keep], self.body[:0], nothing, nothing)
+        body = without(self.body, self.starts[~keep], removed[~keep])
         shift = (np.cumsum(removed) - removed)[keep]
         return replace(self, body=body, starts=self.starts[keep] - shift, ends=self.ends[keep] - shift)
 

@@ -6,6 +6,7 @@ losses and training (learning).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -66,6 +67,11 @@ def edges(offset: Tensor, index: Tensor, count: Tensor | None) -> Edges:
     return Edges(offset / scale[:, :, None], index, weight, scale)
 
 
+def joined(parts: Sequence[Planes]) -> Planes:
+    """The planes of several blocks of rows, one after the other."""
+    return Planes(torch.cat([part.normal for part in parts]), torch.cat([part.shape for part in parts]))
+
+
 def planes(graph: Edges) -> Planes:
     """Weighted PCA of each neighbourhood, without gradient."""
     with torch.no_grad():
@@ -97,8 +103,10 @@ def smallest_eigenvector(matrix: Tensor) -> tuple[Tensor, Tensor]:
     best = length.argmax(dim=1)
     row = torch.arange(len(matrix))
     vector = crosses[row, best] / length[row, best, None].clamp_min(1e-150)
-    lost = length[row, best] < 1e-12
-    vector[lost] = torch.tensor([0.0, 0.0, 1.0], dtype=matrix.dtype)
+    lost = length[row, best] < 1e-12  # all rows along the one large eigenvalue's vector: any direction across it will do
+    along = rows[row, rows.norm(dim=-1).argmax(dim=1)][lost]
+    across = torch.linalg.cross(along, identity[along.abs().argmin(dim=1)])
+    vector[lost] = across / across.norm(dim=-1, keepdim=True)
     return eigenvalues, vector
 
 
@@ -156,8 +164,8 @@ class MessageRound(nn.Module):
 
     def forward(self, features: Tensor, graph: Edges, own: Tensor, heard: Tensor) -> tuple[Tensor, Tensor]:
         """Messages (M, K, C) and the points' new features (M, C). features (M, K, 8), own (M, C), heard (N, C)."""
-        hidden = torch.relu(self.edge(features) + self.own(own)[:, None] + heard[graph.source])
-        message = torch.relu(self.message(hidden))
+        hidden = self.edge(features).add_(self.own(own)[:, None]).add_(heard[graph.source]).relu_()
+        message = self.message(hidden).relu_()
         mean = (graph.weight[:, None] @ message).squeeze(1)
         most = (message * (graph.weight / graph.weight.amax(-1, keepdim=True).clamp_min(1e-12))[:, :, None]).amax(1)
         return message, self.norm(own + self.update(torch.cat([mean, most], dim=-1)))

@@ -1,0 +1,81 @@
+"""What the tests of the core share: clouds of known truth and models that need no training. Not a test itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from pcdenoise.networks.store import Model, ModelConfig
+from pcdenoise.synthesis import shapes
+
+SURFACES = {
+    "plane": shapes.plane(2.0),
+    "sphere": shapes.sphere(1.0),
+    "cylinder": shapes.cylinder(0.6, 2.0),
+    "torus": shapes.torus(1.0, 0.4),
+    "cube": shapes.cube(2.0),
+}
+UTM = np.array([5e5, 4.9e6, 120.0])
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """A noisy sample of a known surface; spacing is the side of the square that each of its points has to itself."""
+
+    surface: shapes.AnalyticSurface
+    clean: np.ndarray
+    noisy: np.ndarray
+    spacing: float
+
+    def error(self, points: np.ndarray) -> float:
+        """Root mean square distance to the surface."""
+        return rms(self.surface.signed_distance(points))
+
+
+def cloud(name: str, n: int, std_spacings: float, seed: int = 0) -> Cloud:
+    """n points uniform by area with Gaussian noise along all axes, its standard deviation a multiple of the spacing."""
+    rng = np.random.default_rng([seed, n])
+    surface = SURFACES[name]
+    clean, spacing = surface.sample(n, rng).points, float(np.sqrt(surface.area / n))
+    return Cloud(surface, clean, clean + std_spacings * spacing * rng.standard_normal((n, 3)), spacing)
+
+
+def ball(n: int, rng: np.random.Generator) -> np.ndarray:
+    """n points strewn evenly through the unit ball: a volume, no surface."""
+    points = rng.standard_normal((n, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True) * rng.random((n, 1)) ** (1 / 3)
+
+
+def rotation(rng: np.random.Generator) -> np.ndarray:
+    """A random proper rotation (3, 3)."""
+    turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+    return turn * np.linalg.det(turn)
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def moves(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """(N,) how far each row went."""
+    return np.linalg.norm(after - before, axis=1)
+
+
+@cache
+def model(kind: str) -> Model:
+    """'untrained': the zero head, a classical filter; 'seeded': a random head, so that every weight of the network counts."""
+    import torch
+
+    from pcdenoise.networks.projection import ProjectionConfig, ProjectionNetwork
+
+    generator = torch.random.get_rng_state()
+    torch.manual_seed(11)
+    network = ProjectionNetwork(ProjectionConfig(landing_rounds=2)).eval()
+    with torch.no_grad():
+        for stage in [*network.stages, network.landing] if kind == "seeded" else []:
+            stage.step.head.weight.normal_(std=0.1)
+    torch.random.set_rng_state(generator)
+    settings = {"channels": 32, "neighbours": 24, "rounds": (2, 2), "landing_rounds": 2}
+    return Model(kind, network, ModelConfig.model_validate({"network": "projection", "settings": settings}), "0" * 64)

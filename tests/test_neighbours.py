@@ -1,0 +1,118 @@
+"""Neighbours against brute force, spatial order as a curve without jumps, hashes that know coordinates only."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy import stats
+
+from pcdenoise.cloud.neighbours import NeighbourSearch, coordinate_hash, distinct, knn, radius_pairs, spatial_order
+
+# A coarse grid makes duplicates and equal distances common; sums of squares of such numbers are exact in float64.
+on_grid = hnp.arrays(np.float64, st.tuples(st.integers(1, 40), st.just(3)), elements=st.integers(-4, 4).map(float))
+anywhere = hnp.arrays(np.float64, st.tuples(st.integers(1, 40), st.just(3)), elements=st.floats(-1e12, 1e12))
+
+
+def all_distances(queries: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.square(queries[:, None] - points[None]).sum(axis=2))
+
+
+@settings(max_examples=60, deadline=None)
+@given(points=on_grid, k=st.integers(1, 60))
+def test_neighbours_of_the_points_themselves_are_the_nearest_of_all(points: np.ndarray, k: int) -> None:
+    distances, indices = knn(points, k, threads=1)
+    every = all_distances(points, points)
+    assert distances.shape == indices.shape == (len(points), min(k, len(points)))
+    np.testing.assert_array_equal(distances, np.sort(every, axis=1)[:, :k])
+    np.testing.assert_array_equal(distances, np.take_along_axis(every, indices, axis=1))
+    assert all(len(set(row)) == len(row) for row in indices.tolist())
+    np.testing.assert_array_equal(points[indices[:, 0]], points)
+
+
+@settings(max_examples=60, deadline=None)
+@given(points=on_grid, queries=on_grid, k=st.integers(1, 60))
+def test_neighbours_of_other_places_are_the_nearest_of_all(points: np.ndarray, queries: np.ndarray, k: int) -> None:
+    distances, indices = knn(points, k, queries, threads=1)
+    every = all_distances(queries, points)
+    np.testing.assert_array_equal(distances, np.sort(every, axis=1)[:, :k])
+    np.testing.assert_array_equal(distances, np.take_along_axis(every, indices, axis=1))
+
+
+@settings(max_examples=40, deadline=None)
+@given(points=on_grid, seed=st.integers(0, 99))
+def test_distances_to_neighbours_follow_their_rows_in_any_order(points: np.ndarray, seed: int) -> None:
+    order = np.random.default_rng(seed).permutation(len(points))
+    np.testing.assert_array_equal(knn(points[order], 8, threads=1)[0], knn(points, 8, threads=1)[0][order])
+
+
+@settings(max_examples=60, deadline=None)
+@given(points=on_grid, radius=st.sampled_from([0.5, 1.0, 2.0, 3.0, 20.0]))
+def test_pairs_within_a_radius_are_all_pairs_up_to_and_with_that_distance(points: np.ndarray, radius: float) -> None:
+    first, second = np.nonzero(np.triu(all_distances(points, points) <= radius, k=1))
+    pairs = radius_pairs(points, radius)
+    assert (pairs[:, 0] < pairs[:, 1]).all()
+    assert sorted(map(tuple, pairs.tolist())) == list(zip(first.tolist(), second.tolist(), strict=True))
+
+
+def test_the_number_of_threads_does_not_change_the_neighbours(rng: np.random.Generator) -> None:
+    points = rng.standard_normal((3000, 3))
+    for one, two in zip(NeighbourSearch(points, 1).knn(points, 9), NeighbourSearch(points, 2).knn(points, 9), strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+@settings(max_examples=80, deadline=None)
+@given(points=anywhere)
+def test_spatial_order_is_a_permutation_of_any_finite_points(points: np.ndarray) -> None:
+    assert sorted(spatial_order(points).tolist()) == list(range(len(points)))
+
+
+@pytest.mark.parametrize("unit", [5e-323, 1e-300, 0.1, 1e15])
+def test_spatial_order_visits_a_grid_of_any_unit_cube_by_cube(rng: np.random.Generator, unit: float) -> None:
+    """Morton: every aligned run of 8^j points of a grid of side 2^m fills a cube of side 2^j."""
+    grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    shuffled = rng.permutation(grid)
+    along = shuffled[spatial_order(shuffled * unit)]
+    for level in (1, 2):
+        runs = along.reshape(-1, 8**level, 3)
+        np.testing.assert_array_equal(np.ptp(runs, axis=1), 2.0**level - 1)
+
+
+def test_spatial_order_of_nothing_one_place_and_one_far_point() -> None:
+    assert spatial_order(np.zeros((0, 3))).tolist() == []
+    assert spatial_order(np.full((5, 3), 7e6)).tolist() == [0, 1, 2, 3, 4]
+    assert spatial_order(np.array([[1e9, 0, 0], [0.0, 0, 0], [1, 0, 0]])).tolist() == [1, 2, 0]
+
+
+@settings(max_examples=40, deadline=None)
+@given(points=anywhere, seed=st.integers(0, 2**63 - 1))
+def test_a_hash_belongs_to_the_place_and_the_seed_and_not_to_the_row(points: np.ndarray, seed: int) -> None:
+    whole = coordinate_hash(points, seed)
+    np.testing.assert_array_equal(coordinate_hash(points[::-1], seed), whole[::-1])
+    np.testing.assert_array_equal([coordinate_hash(points[i : i + 1], seed)[0] for i in range(len(points))], whole)
+    np.testing.assert_array_equal(coordinate_hash(np.where(points == 0, -0.0, points), seed), whole)
+
+
+def test_hashes_of_a_regular_grid_are_uniform_and_unlike_under_other_seeds_and_swapped_axes() -> None:
+    grid = np.stack(np.meshgrid(*[np.arange(32.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    hashes = [coordinate_hash(points, seed) for points, seed in ((grid, 0), (grid, 1), (grid[:, ::-1], 0))]
+    for some in hashes:
+        assert len(np.unique(some)) == len(grid)
+        for shift in (0, 24, 56):  # low, middle and high bytes
+            counts = np.bincount((some >> np.uint64(shift) & np.uint64(255)).astype(int), minlength=256)
+            assert stats.chisquare(counts).pvalue > 1e-4
+    swapped = grid[:, 0] != grid[:, 2]
+    for other in (hashes[1], hashes[2]):
+        assert (other != hashes[0])[swapped].all()
+        assert abs(np.corrcoef(other[swapped], hashes[0][swapped])[0, 1]) < 4 / np.sqrt(len(grid))
+
+
+@settings(max_examples=60, deadline=None)
+@given(points=on_grid)
+def test_distinct_keeps_one_row_of_each_place_and_says_where_the_others_went(points: np.ndarray) -> None:
+    rows, place = distinct(points)
+    assert len(rows) == len(np.unique(points + 0.0, axis=0)) == len(np.unique(points[rows] + 0.0, axis=0))
+    np.testing.assert_array_equal(points[rows][place], points)
+    np.testing.assert_array_equal(place[rows], np.arange(len(rows)))
