@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 
 import numpy as np
@@ -70,12 +70,10 @@ def model(kind: str) -> Model:
 
     from pcdenoise.networks.projection import ProjectionConfig, ProjectionNetwork
 
-    generator = torch.random.get_rng_state()
-    torch.manual_seed(11)
-    network = ProjectionNetwork(ProjectionConfig(landing_rounds=2)).eval()
-    with torch.no_grad():
-        for stage in [*network.stages, network.landing] if kind == "seeded" else []:
+    with torch.inference_mode(False), torch.random.fork_rng(), torch.no_grad():
+        torch.manual_seed(11)
+        network = ProjectionNetwork(ProjectionConfig(landing_rounds=2)).eval()
+        for stage in [*network.among, network.landing] if kind == "seeded" else []:
             stage.step.head.weight.normal_(std=0.1)
-    torch.random.set_rng_state(generator)
-    settings = {"channels": 32, "neighbours": 24, "rounds": (2, 2), "landing_rounds": 2}
+    settings = asdict(network.config)
     return Model(kind, network, ModelConfig.model_validate({"network": "projection", "settings": settings}), "0" * 64)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from known_clouds import SURFACES, UTM, ball, cloud, rotation
 
+from known_clouds import SURFACES, UTM, ball, cloud, rotation
 from pcdenoise.cloud.noise_level import NoiseLevel, estimate
 
 NO_SURFACE = {

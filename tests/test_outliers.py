@@ -14,7 +14,7 @@ from pcdenoise.denoising.outliers import find
 from pcdenoise.errors import UsageError
 
 DATA = Path(os.environ.get("PCDENOISE_DATA", Path(__file__).parents[2] / "shared" / "data"))
-N = 4000
+N = 6000
 Scene = Callable[[np.random.Generator], np.ndarray]
 
 
@@ -109,8 +109,8 @@ def test_scattered_points_farther_than_the_12th_neighbour_are_found(rng: np.rand
     reach = np.median(knn(points, 13)[0][:, -1])
     clear = added.copy()
     clear[added] = knn(points, 1, cloud[added])[0][:, 0] > 1.5 * reach
-    assert found[clear].mean() >= 0.95
-    assert found[added].sum() >= 0.98 * found.sum()
+    assert found[clear].mean() >= 0.9
+    assert found[~added].mean() <= 1e-3
 
 
 @pytest.mark.parametrize("share", [0.01, 0.05])
@@ -120,7 +120,7 @@ def test_gross_errors_near_the_surface_are_found(rng: np.random.Generator, noise
     gross = rng.random(N) < share
     stds[gross] = rng.uniform(5, 20, gross.sum()) * rng.choice([-1, 1], gross.sum())
     found = find(sphere(rng) * (1 + noise * stds[:, None]))
-    assert found[gross & (np.abs(stds) > 8)].mean() >= 0.93
+    assert found[gross & (np.abs(stds) > 8)].mean() >= 0.9
     assert found[gross].mean() >= 0.8
     assert found[~gross].mean() <= 1e-3
 

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -173,6 +175,19 @@ def _one_pass(
     return relax(within(_FURTHEST_STDS * level.std, points, moved), level.std, config.relax_steps, threads)
 
 
+@contextmanager
+def _single_threaded_torch() -> Iterator[None]:
+    """`descend` has threads of its own; torch's would wait for each other."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 def _network_pass(
     points: Points, level: NoiseLevel, model: Model, seed: int, threads: int, on_share: Callable[[float], None]
 ) -> Points:
@@ -181,23 +196,24 @@ def _network_pass(
     from pcdenoise.denoising.pyramid import coarsen, descend, share_of_seeds
 
     network = model.network
-    torch.set_num_threads(threads)
     share = share_of_seeds(level, network.config.neighbours)
-    done = 0
-    seeds, count = points, None
+    done, counting = 0, Lock()
+    seeds, count, cell = points, None, np.arange(len(points))
     if share < 1:
         coarse = coarsen(points, share, seed, threads)
-        seeds, count = coarse.points, coarse.count
+        seeds, count, cell = coarse.points, coarse.count, coarse.cell
     total = len(seeds) * sum(network.config.rounds) + (len(points) * network.config.landing_rounds if share < 1 else 0)
 
     def on_block(n: int) -> None:
         nonlocal done
-        done += n
-        on_share(done / total)
+        with counting:
+            done += n
+            on_share(done / total)
 
-    with torch.inference_mode():
+    with _single_threaded_torch(), torch.no_grad():
         descent = descend(network, seeds, count, points if share < 1 else None, level.std, threads=threads, on_block=on_block)
         moved: Points = (descent.seeds[-1] if descent.landed is None else descent.landed).numpy()
     if not np.isfinite(moved).all():
         raise ModelError(f"model {model.name}: gave positions that are not numbers; use another model or --method jet")
-    return moved
+    trust = descent.trust.numpy().astype(np.float64)[cell, None]
+    return points + trust * (moved - points)

@@ -6,8 +6,10 @@ rules (denoiser.py).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -27,7 +29,10 @@ from pcdenoise.networks.projection import (
     joined,
     planes,
     point_features,
+    trust,
 )
+
+T = TypeVar("T")
 
 _APART = {1: 0.52, 2: 0.39, 3: 0.31, 5: 0.23}
 """Share of candidates that remain when none may be among the so many nearest of another (measured)."""
@@ -39,10 +44,11 @@ BLOCK_POINTS = 2048
 
 @dataclass(frozen=True)
 class Seeds:
-    """points (M, 3): means of the raw points in each seed's cell; count (M,): how many they are."""
+    """points (M, 3): means of the raw points in each seed's cell; count (M,) of them; cell (N,): each raw point's seed."""
 
     points: Points
     count: NDArray[np.float64]
+    cell: Indices
 
 
 def share_of_seeds(level: NoiseLevel, neighbours: int) -> float:
@@ -61,16 +67,15 @@ def coarsen(points: Points, share: float, seed: int = 0, threads: int = -1) -> S
     apart = max((n for n, left in _APART.items() if left >= share), default=1)
     candidates = points[coordinate_hash(points, seed) < np.uint64(min(share / _APART[apart], 1.0) * float(2**64 - 2**11))]
     if len(candidates) <= apart + 1:
-        return Seeds(points, np.ones(len(points)))
+        return Seeds(points, np.ones(len(points)), np.arange(len(points)))
     chosen = candidates[_first_among_nearest(candidates, coordinate_hash(candidates, seed + 1), apart, threads)]
     cell = NeighbourSearch(chosen, threads).knn(points, 1)[1][:, 0]
     count = np.bincount(cell, minlength=len(chosen)).astype(np.float64)
     filled = count > 0
     origin = chosen.mean(axis=0)
-    sums = np.stack(
-        [np.bincount(cell, weights=points[:, axis] - origin[axis], minlength=len(chosen)) for axis in range(3)], axis=1
-    )
-    return Seeds(sums[filled] / count[filled, None] + origin, count[filled])
+    sums = np.stack([np.bincount(cell, weights=column, minlength=len(chosen)) for column in (points - origin).T], axis=1)
+    number = np.cumsum(filled) - 1
+    return Seeds(sums[filled] / count[filled, None] + origin, count[filled], number[cell])
 
 
 def _first_among_nearest(candidates: Points, rank: NDArray[np.uint64], apart: int, threads: int) -> Indices:
@@ -94,9 +99,13 @@ def _first_among_nearest(candidates: Points, rank: NDArray[np.uint64], apart: in
 
 @dataclass(frozen=True)
 class Descent:
-    """What a run of the network gives: the seeds after every stage, (M, 3) each; landed raw points (Q, 3), if any."""
+    """What a run of the network gives.
+
+    seeds: their places after every stage, (M, 3) each; trust (M,): see networks.projection; landed: raw points (Q, 3), if any.
+    """
 
     seeds: list[Tensor]
+    trust: Tensor
     landed: Tensor | None
 
 
@@ -108,7 +117,7 @@ def descend(
     noise: float,
     *,
     block_points: int = BLOCK_POINTS,
-    threads: int = -1,
+    threads: int = 1,
     on_block: Callable[[int], None] = lambda _: None,
 ) -> Descent:
     """Runs the network on (M, 3) seeds and lands (Q, 3) raw points on them; differentiable where gradients are on.
@@ -120,21 +129,23 @@ def descend(
     weights = None if count is None else torch.from_numpy(count.astype(np.float32))
     features: Tensor | None = None
     stages: list[Tensor] = []
+    surface = torch.ones(0)
     for stage in network.among:
         looking = _Looking(points, points, weights, k, noise, block_points, threads)
         own, known = looking.around(stage)
+        surface = surface if stages else trust(own, noise)
         features = known if features is None else features + known
         move, features = looking.messages(stage, own, own, features, features, on_block)
         points = points + move.double()
         stages.append(points)
     if raw is None or features is None:
-        return Descent(stages, None)
+        return Descent(stages, surface, None)
     seed_planes = _Looking(points, points, weights, k, noise, block_points, threads).planes()
     landing = torch.from_numpy(raw)
     looking = _Looking(landing, points, weights, k, noise, block_points, threads)
     own, known = looking.around(network.landing)
     move, _ = looking.messages(network.landing, own, seed_planes, known, features, on_block)
-    return Descent(stages, landing + move.double())
+    return Descent(stages, surface, landing + move.double())
 
 
 class _Looking:
@@ -143,31 +154,45 @@ class _Looking:
     def __init__(
         self, points: Tensor, sources: Tensor, count: Tensor | None, k: int, noise: float, block_points: int, threads: int
     ) -> None:
-        self.points, self.sources, self.count, self.noise = points, sources, count, noise
+        self.points, self.sources, self.count, self.noise, self.threads = points, sources, count, noise, threads
         index = NeighbourSearch(sources.detach().numpy(), threads).knn(points.detach().numpy(), k)[1]
         self.index = torch.from_numpy(index.astype(np.int32))
-        n = len(points)
-        self.blocks: Sequence[slice] = [slice(i, min(i + block_points, n)) for i in range(0, n, block_points)]
+        self.blocks = [slice(i, min(i + block_points, len(points))) for i in range(0, len(points), block_points)]
         self._only: Edges | None = None
+        self._only_features: tuple[Tensor, Tensor, Tensor] | None = None
 
-    def graphs(self) -> Iterator[tuple[slice, Edges]]:
-        """Every block with its edges."""
-        for block in self.blocks:
-            if self._only is None or len(self.blocks) > 1:
-                index = self.index[block].long()
-                self._only = edges((self.sources[index] - self.points[block, None]).float(), index, self.count)
-            yield block, self._only
+    def over_blocks(self, work: Callable[[slice, Edges], T]) -> list[T]:
+        """What `work` gives for each block and its edges. Blocks are spread over threads; a block's own work is done by one,
+        since threads that wait for each other after every small operation cost more than they do."""
+        if len(self.blocks) == 1:
+            if self._only is None:
+                self._only = self._edges(self.blocks[0])
+            return [work(self.blocks[0], self._only)]
+        with_gradient = torch.is_grad_enabled()  # known to this thread alone
+
+        def one(block: slice) -> T:
+            with torch.set_grad_enabled(with_gradient):
+                return work(block, self._edges(block))
+
+        with ThreadPoolExecutor(max(1, self.threads)) as pool:
+            return list(pool.map(one, self.blocks))
+
+    def _edges(self, block: slice) -> Edges:
+        index = self.index[block].long()
+        return edges((self.sources[index] - self.points[block, None]).float(), index, self.count)
 
     def planes(self) -> Planes:
         """Tangent planes of all points."""
-        return joined([planes(graph) for _, graph in self.graphs()])
+        return joined(self.over_blocks(lambda _, graph: planes(graph)))
 
     def around(self, stage: Stage) -> tuple[Planes, Tensor]:
         """Tangent planes and first features (M, C) of all points."""
-        found, known = [], []
-        for _, graph in self.graphs():
-            found.append(planes(graph))
-            known.append(stage.embed(point_features(graph, found[-1], self.noise)))
+
+        def look(_: slice, graph: Edges) -> tuple[Planes, Tensor]:
+            plane = planes(graph)
+            return plane, stage.embed(point_features(graph, plane, self.noise))
+
+        found, known = zip(*self.over_blocks(look), strict=True)
         return joined(found), torch.cat(known)
 
     def messages(
@@ -175,22 +200,28 @@ class _Looking:
     ) -> tuple[Tensor, Tensor]:
         """(M, 3) moves and (M, C) features after all rounds of a stage; among themselves, points hear of each other's news."""
         among = sources is features
-        cached: tuple[Tensor, Tensor, Tensor] | None = None
         move = torch.zeros(0)
-        for number, layer in enumerate(stage.exchanges):
-            news, moves = [], []
+        for number, layer in enumerate(stage.exchanges, start=1):
+            last = number == len(stage.exchanges)
             heard = layer.hear(features if among else sources)
-            for block, graph in self.graphs():
+            before = features
+
+            def exchange(block: slice, graph: Edges) -> tuple[Tensor, Tensor]:
                 mine = own.block(block)
-                if cached is None or len(self.blocks) > 1:
-                    cached = edge_features(graph, mine, theirs, self.noise)
-                edge, a, b = cached
-                message, new = layer(edge, graph, features[block], heard)
-                news.append(new)
-                if number == len(stage.exchanges) - 1:
-                    moves.append(stage.step(message, graph, mine, theirs, a, b))
+                edge, a, b = self._features(graph, mine, theirs)
+                message, news = layer(edge, graph, before[block], heard)  # noqa: B023
+                step = stage.step(message, graph, mine, theirs, a, b) if last else message[:0]  # noqa: B023
                 on_block(block.stop - block.start)
+                return news, step
+
+            news, moves = zip(*self.over_blocks(exchange), strict=True)
             features = torch.cat(news)
-            if moves:
-                move = torch.cat(moves)
+            move = torch.cat(moves) if last else move
         return move, features
+
+    def _features(self, graph: Edges, mine: Planes, theirs: Planes) -> tuple[Tensor, Tensor, Tensor]:
+        if len(self.blocks) > 1:
+            return edge_features(graph, mine, theirs, self.noise)
+        if self._only_features is None:
+            self._only_features = edge_features(graph, mine, theirs, self.noise)
+        return self._only_features

@@ -26,7 +26,8 @@ def relax(points: Points, noise_std: float, steps: int, threads: int = -1) -> Po
     """Evens the spacing of (N, 3) finite, distinct points on a surface; row i stays row i, N < 4 comes back as it was.
 
     Each step pushes a point away from neighbours that are nearer than the local mean, inside the tangent plane of its
-    neighbourhood; at the end all land on the surface again. Where that is no sheet (wires, volumes, corners) points stay, or spreading them would change the shape.
+    neighbourhood; at the end all land on the surface again. Where that is no sheet (wires, volumes, corners) points stay, or
+    spreading them would change the shape.
     """
     if len(points) <= 3 or noise_std <= 0 or steps == 0:
         return points
@@ -58,7 +59,7 @@ def within(reach: float, start: Points, moved: Points) -> Points:
     """(N, 3) moved points, but none further than `reach` from its start."""
     slide = moved - start
     length = np.linalg.norm(slide, axis=1, keepdims=True)
-    cut: Points = start + slide * np.minimum(1, reach / np.maximum(length, 1e-300))
+    cut: Points = start + slide * (reach / np.maximum(length, max(reach, 1e-300)))
     return cut
 
 
@@ -78,7 +79,7 @@ def _push(points: Points, normals: Points, spacing: NDArray[np.float64], index: 
     push = np.einsum("mk,mki->mi", strength * reach[:, None] / distance, away)
     push -= (push * normal).sum(axis=1, keepdims=True) * normal
     length = np.linalg.norm(push, axis=1, keepdims=True)
-    step: Points = _STEP * push * np.minimum(1, reach[:, None] / np.maximum(length, 1e-300))
+    step: Points = _STEP * push * (reach[:, None] / np.maximum(np.maximum(length, reach[:, None]), 1e-300))
     return step
 
 

@@ -42,7 +42,7 @@ class Edges(NamedTuple):
 
 
 class Planes(NamedTuple):
-    """Tangent planes of M points: normal (M, 3), of either sign; shape (M, 3): standard deviations along the main axes."""
+    """Tangent planes of M points: normal (M, 3), of either sign; shape (M, 3): standard deviations along the axes."""
 
     normal: Tensor
     shape: Tensor
@@ -80,7 +80,7 @@ def planes(graph: Edges) -> Planes:
         spread = offset - mean[:, None]
         covariance = torch.einsum("mki,mkj->mij", spread * weight[:, :, None], spread)
         eigenvalues, normal = smallest_eigenvector(covariance)
-        return Planes(normal.to(graph.offset), eigenvalues.clamp_min(0).sqrt().to(graph.offset))
+        return Planes(normal.to(graph.offset), graph.scale * eigenvalues.clamp_min(0).sqrt().to(graph.offset))
 
 
 def smallest_eigenvector(matrix: Tensor) -> tuple[Tensor, Tensor]:
@@ -112,9 +112,21 @@ def smallest_eigenvector(matrix: Tensor) -> tuple[Tensor, Tensor]:
 
 def point_features(graph: Edges, plane: Planes, noise: float) -> Tensor:
     """(M, 4) what a point knows of its surroundings: thickness, narrowness, noise in its scale, noise explaining thickness."""
-    thin, middle, wide = plane.shape.unbind(-1)
+    thin, middle, wide = (plane.shape / graph.scale).unbind(-1)
     level = noise / graph.scale[:, 0]
     return torch.stack([2 * thin, 2 * (wide - middle), 4 * level / (1 + level), thin / (thin + level + 1e-6)], dim=-1)
+
+
+def trust(plane: Planes, noise: float) -> Tensor:
+    """(M,) from 0, no surface here (foliage, wires, clutter), to 1: the noise explains how thick it is, or it is flat anyway.
+
+    On noisy surfaces 19 of 20 neighbourhoods are thinner than 1.5 std; a wire or a filled volume has a planarity,
+    (middle - thin) / wide, of about 0.2, a plane 0.7, the edge of a box 0.35.
+    """
+    thin, middle, wide = plane.shape.unbind(-1)
+    unexplained = ((thin / max(noise, 1e-30) - 1.5) / 0.7).clamp(0, 1)
+    flat = (((middle - thin) / wide.clamp_min(1e-30) - 0.15) / 0.2).clamp(0, 1)
+    return 1 - unexplained * (1 - flat)
 
 
 def edge_features(graph: Edges, own: Planes, theirs: Planes, noise: float) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,0 +1,120 @@
+"""Relaxation evens the spacing, stays on the surface, goes no further than the noise and leaves what is no sheet alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from known_clouds import UTM, ball, cloud, moves, rms, rotation
+from pcdenoise.cloud.neighbours import knn
+from pcdenoise.denoising import relaxation
+from pcdenoise.denoising.relaxation import relax
+
+STEPS = 8
+
+
+def unevenness(points: np.ndarray) -> float:
+    """Coefficient of variation of the distance to the nearest other point: 0.52 for Poisson points, 0 for a lattice."""
+    nearest = knn(points, 2, threads=1)[0][:, 1]
+    return float(nearest.std() / nearest.mean())
+
+
+def test_chance_becomes_even_spacing_on_a_plane_that_is_not_left() -> None:
+    flat = cloud("plane", 3000, 0.0)
+    relaxed = relax(flat.clean, flat.spacing, STEPS, threads=1)
+    assert unevenness(flat.clean) == pytest.approx(np.sqrt(4 / np.pi - 1), rel=0.05)
+    assert unevenness(relaxed) < 0.5 * unevenness(flat.clean)
+    np.testing.assert_allclose(relaxed[:, 2], 0, atol=1e-15)
+
+
+@pytest.mark.parametrize(("name", "curvature"), [("sphere", 1.0), ("cylinder", 1 / 0.6), ("torus", 1 / 0.4)])
+def test_on_a_curved_surface_points_slide_and_land_on_it_again(name: str, curvature: float) -> None:
+    clean = cloud(name, 3000, 0.0)
+    inner = np.abs(clean.clean[:, 2]) < 0.8 if name == "cylinder" else np.ones(3000, dtype=bool)  # away from the rims
+    relaxed = relax(clean.clean, 0.5 * clean.spacing, STEPS, threads=1)
+    slide = moves(clean.clean, relaxed)
+    assert unevenness(relaxed) < 0.6 * unevenness(clean.clean)
+    assert np.median(slide) > 0.1 * clean.spacing
+    # The 12 neighbours of a landing point reach ρ = spacing √(12 / π) and lie up to κρ²/2 under its tangent plane; the half sum
+    # of heights and depths cancels that where they surround the point, and no neighbourhood may err by more than its depth.
+    left, reach = np.abs(clean.surface.signed_distance(relaxed))[inner], knn(clean.clean, 13, threads=1)[0][:, -1].max()
+    assert rms(left) < 0.1 * curvature * clean.spacing**2 * 12 / np.pi / 2
+    assert left.max() < curvature * reach**2 / 2
+
+
+@pytest.mark.parametrize("name", ["plane", "torus", "cube"])
+def test_no_point_goes_further_than_the_noise_can_have_displaced_it(name: str) -> None:
+    clean, reach = cloud(name, 2000, 0.0), relaxation._REACH_STDS
+    assert reach <= 2
+    for std in (0.01 * clean.spacing, 0.2 * clean.spacing):
+        slide = moves(clean.clean, relax(clean.clean, std, 30, threads=1))
+        assert slide.max() <= reach * std * (1 + 1e-9)
+        assert slide.max() > 0.95 * reach * std  # the bound is met, or this would test nothing
+
+
+def test_without_noise_without_steps_and_with_few_points_nothing_moves(rng: np.random.Generator) -> None:
+    points = cloud("sphere", 500, 0.0).clean
+    np.testing.assert_array_equal(relax(points, 0.0, STEPS, threads=1), points)
+    np.testing.assert_array_equal(relax(points, 0.1, 0, threads=1), points)
+    for n in range(4):
+        few = rng.random((n, 3))
+        np.testing.assert_array_equal(relax(few, 1.0, STEPS, threads=1), few)
+
+
+@pytest.mark.parametrize("n", [4, 5, 12, 13, 14])
+def test_a_handful_of_points_stays_finite_and_within_the_bound(rng: np.random.Generator, n: int) -> None:
+    points = np.column_stack([rng.random((n, 2)), np.zeros(n)])
+    relaxed = relax(points, 0.01, STEPS, threads=1)
+    assert moves(points, relaxed).max() <= 0.01 * relaxation._REACH_STDS * (1 + 1e-9)
+
+
+def test_a_lattice_is_at_rest() -> None:
+    angle = np.arange(30.0)
+    x, y = np.meshgrid(angle, angle)
+    lattice = np.stack([x + y / 2, y * np.sqrt(0.75), np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    inner = (x > 8) & (x < 21) & (y > 8) & (y < 21)
+    slide = moves(lattice, relax(lattice, 1.0, 3, threads=1)).reshape(x.shape)
+    assert slide[inner].max() < 1e-9
+
+
+def test_points_on_a_wire_do_not_fan_out_to_a_ribbon(rng: np.random.Generator) -> None:
+    # Repulsion along a line buckles it: without a second dimension to spread in there must be no push at all.
+    t = np.sort(rng.random(400)) * 6
+    wire = np.column_stack([t, np.sin(t), 0.3 * np.cos(2 * t)])
+    np.testing.assert_allclose(relax(wire, 0.05, STEPS, threads=1), wire, atol=1e-3)
+
+
+def test_points_in_a_volume_move_less_than_on_a_sheet(rng: np.random.Generator) -> None:
+    # Bound by the noise all the same; planarity of chance neighbourhoods in a volume is 0.21 in the median.
+    volume, sheet = ball(3000, rng), cloud("plane", 3000, 0.0)
+    apart = [np.median(knn(points, 2, threads=1)[0][:, 1]) for points in (volume, sheet.clean)]
+    slides = [
+        np.median(moves(points, relax(points, 0.5 * a, STEPS, threads=1))) / a
+        for points, a in zip((volume, sheet.clean), apart, strict=True)
+    ]
+    assert slides[0] < 0.3 * slides[1]
+
+
+def test_relaxation_follows_turns_shifts_units_and_the_order_of_rows(rng: np.random.Generator) -> None:
+    noisy = cloud("torus", 1200, 0.1)
+    std, order, turn = 0.3 * noisy.spacing, rng.permutation(1200), rotation(rng)
+    relaxed = relax(noisy.noisy, std, STEPS, threads=1)
+    np.testing.assert_allclose(relax(noisy.noisy[order], std, STEPS, threads=1), relaxed[order], atol=1e-9)
+    np.testing.assert_allclose(relax(noisy.noisy @ turn.T, std, STEPS, threads=1), relaxed @ turn.T, atol=1e-9)
+    np.testing.assert_allclose(relax(noisy.noisy * 1e3, std * 1e3, STEPS, threads=1), relaxed * 1e3, atol=1e-6)
+    # One float64 step of a northing is 1e-9; the sine of a plane through points 0.1 apart errs by 1e-8 and some more.
+    np.testing.assert_allclose(relax(noisy.noisy + UTM, std, STEPS, threads=1) - UTM, relaxed, atol=1e-6)
+
+
+def test_blocks_and_threads_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    noisy = cloud("torus", 1200, 0.1)
+    whole = relax(noisy.noisy, 0.3 * noisy.spacing, STEPS, threads=1)
+    monkeypatch.setattr(relaxation, "_BLOCK", 101)
+    np.testing.assert_allclose(relax(noisy.noisy, 0.3 * noisy.spacing, STEPS, threads=2), whole, atol=1e-12)
+
+
+def test_the_input_is_not_written_to() -> None:
+    points = cloud("torus", 500, 0.1).noisy
+    before = points.copy()
+    relax(points, 0.1, STEPS, threads=1)
+    np.testing.assert_array_equal(points, before)
