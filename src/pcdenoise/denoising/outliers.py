@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdenoise.cloud import noise_level
-from pcdenoise.cloud.neighbours import Distances, Indices, NeighbourSearch, spatial_order
+from pcdenoise.cloud.neighbours import Distances, Indices, NeighbourSearch, distinct, spatial_order
 from pcdenoise.cloud.scan import Mask, Points
 from pcdenoise.errors import UsageError
 
@@ -53,18 +53,19 @@ def find(points: Points, *, isolation: float = 4.0, deviation: float = 6.0, thre
         raise UsageError(f"isolation: must be above 1, got {isolation}")
     if deviation <= 0:
         raise UsageError(f"deviation: must be above 0, got {deviation}")
-    distinct, row_of = np.unique(points, axis=0, return_inverse=True)
-    if len(distinct) <= _SURROUNDINGS:
+    rows, place = distinct(points)
+    if len(rows) <= _SURROUNDINGS:
         return np.zeros(len(points), dtype=np.bool_)
-    kept = spatial_order(distinct)
+    places = points[rows]
+    kept = spatial_order(places)
     for _ in range(_ROUNDS):
-        lonely = _lonely(distinct[kept], isolation, threads)
+        lonely = _lonely(places[kept], isolation, threads)
         if not lonely.any() or len(kept) - lonely.sum() <= _SURROUNDINGS:
             break
         kept = kept[~lonely]
-    outlier = np.ones(len(distinct), dtype=np.bool_)
-    outlier[kept] = _off_surface(distinct[kept], deviation, threads)
-    return outlier[row_of.reshape(-1)]
+    outlier = np.ones(len(places), dtype=np.bool_)
+    outlier[kept] = _off_surface(places[kept], deviation, threads)
+    return outlier[place]
 
 
 def _lonely(points: Points, isolation: float, threads: int) -> Mask:

@@ -19,6 +19,8 @@ from torch import Tensor
 from pcdenoise.cloud.neighbours import Indices, NeighbourSearch, coordinate_hash
 from pcdenoise.cloud.noise_level import NoiseLevel
 from pcdenoise.cloud.scan import Points
+from pcdenoise.errors import ModelError
+from pcdenoise.errors import ModelError
 from pcdenoise.networks.projection import (
     Edges,
     Planes,
@@ -123,6 +125,7 @@ def descend(
     """Runs the network on (M, 3) seeds and lands (Q, 3) raw points on them; differentiable where gradients are on.
 
     Points stay float64 and only differences between neighbours become float32. The result does not depend on `block_points`.
+    Raises ModelError when a stage gives positions that are not numbers.
     """
     k = network.config.neighbours
     points = torch.from_numpy(seeds)
@@ -136,7 +139,7 @@ def descend(
         surface = surface if stages else trust(own, noise)
         features = known if features is None else features + known
         move, features = looking.messages(stage, own, own, features, features, on_block)
-        points = points + move.double()
+        points = _numbers(points + move.double())
         stages.append(points)
     if raw is None or features is None:
         return Descent(stages, surface, None)
@@ -145,7 +148,14 @@ def descend(
     looking = _Looking(landing, points, weights, k, noise, block_points, threads)
     own, known = looking.around(network.landing)
     move, _ = looking.messages(network.landing, own, seed_planes, known, features, on_block)
-    return Descent(stages, surface, landing + move.double())
+    return Descent(stages, surface, _numbers(landing + move.double()))
+
+
+def _numbers(points: Tensor) -> Tensor:
+    """The points. Raises ModelError where one is no number, which only broken weights bring about."""
+    if not bool(points.isfinite().all()):
+        raise ModelError("the network gave positions that are not numbers; use another model, or --method jet")
+    return points
 
 
 class _Looking:
@@ -154,6 +164,8 @@ class _Looking:
     def __init__(
         self, points: Tensor, sources: Tensor, count: Tensor | None, k: int, noise: float, block_points: int, threads: int
     ) -> None:
+        if not sources.isfinite().all():
+            raise ModelError("the network gave positions that are not numbers; use another model or --method jet")
         self.points, self.sources, self.count, self.noise, self.threads = points, sources, count, noise, threads
         index = NeighbourSearch(sources.detach().numpy(), threads).knn(points.detach().numpy(), k)[1]
         self.index = torch.from_numpy(index.astype(np.int32))
