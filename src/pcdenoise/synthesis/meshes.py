@@ -212,9 +212,7 @@ def _bodies(mesh: Mesh) -> list[_Body]:
     start, end = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
     _, label = connected_components(coo_array((np.ones(len(start), dtype=bool), (start, end)), shape=(n, n)), directed=False)
     of_face = label[mesh.faces[:, 0]]
-    _, inverse, count = np.unique(
-        np.minimum(start, end) * n + np.maximum(start, end), return_inverse=True, return_counts=True
-    )
+    _, inverse, count = np.unique(np.minimum(start, end) * n + np.maximum(start, end), return_inverse=True, return_counts=True)
     closed_face = (count[inverse.reshape(-1, 3)] == 2).all(axis=1)
     corners = mesh.corners
     centre = corners.mean(axis=(0, 1))
