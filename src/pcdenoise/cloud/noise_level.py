@@ -20,8 +20,9 @@ _SURFACE_ASPECT = 3.8
 
 A ball that is filled with noise has 2.3 to 2.9 at any size, a disc of radius R under noise std has R / std.
 """
-_CERTAIN_ASPECT = 4.4
-"""Only a surface reaches so much on some rung: a solid ball, cube or blob has up to 4.3, once a neighbourhood is half of it."""
+_CERTAIN_ASPECT, _SMALL_SHARE = 4.4, 1 / 16
+"""A surface shows in a small share of the cloud, or more clearly than a solid ball, cube or blob ever does: those have up to 4.3,
+once a neighbourhood is half of them."""
 _CLEARER_SHARE = 0.3  # this share of all places must show it: edges and thin parts stay thick at any scale
 _SCALE_STDS = 4.5  # the radius of the neighbourhood of `scale_points`
 
@@ -48,12 +49,14 @@ def estimate(points: Points, seed: int = 0, threads: int = -1) -> NoiseLevel:
     """
     points = points[distinct(points)[0]]
     points = points[spatial_order(points)]
-    if len(points) < _LADDER[0]:
+    if len(points) < 2:
         return NoiseLevel(0.0, 0.0, float(_LADDER[0]), False)
     rng = np.random.default_rng(seed)
     probes = points[np.sort(rng.choice(len(points), size=min(N_PROBES, len(points)), replace=False))]
     search = NeighbourSearch(points, threads)
     spacing = float(np.median(search.knn(probes, 2)[0][:, 1]))
+    if len(points) < _LADDER[0]:
+        return NoiseLevel(0.0, spacing, float(_LADDER[0]), False)
 
     rungs: list[_Rung] = []
     for k in (k for k in _LADDER if k <= len(points)):
@@ -70,7 +73,7 @@ def estimate(points: Points, seed: int = 0, threads: int = -1) -> NoiseLevel:
     if not shown:
         return NoiseLevel(max(rungs, key=lambda rung: rung.aspect).std, spacing, float(_LADDER[0]), False)
     std = shown[0].std
-    certain = max(rung.aspect for rung in shown) >= _CERTAIN_ASPECT
+    certain = shown[0].k <= _SMALL_SHARE * len(points) or max(rung.aspect for rung in shown) >= _CERTAIN_ASPECT
     return NoiseLevel(std, spacing, _points_within(_SCALE_STDS * std, rungs), certain)
 
 

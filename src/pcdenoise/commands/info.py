@@ -132,12 +132,10 @@ def _but(count: int, what: str) -> str:
 
 
 def _noise(found: dict[str, Any]) -> str:
-    share = f"{found['noise_share_of_diagonal']:.3%} of the diagonal, {found['noise'] / found['spacing']:.2g} spacings"
-    return (
-        f"{figure(found['noise'])} ({share})"
-        if found["is_surface"]
-        else "no surface at any scale: leaves, clutter or a filled volume"
-    )
+    if not found["is_surface"]:
+        return "no surface at any scale: leaves, clutter, a filled volume, or too few points to tell"
+    spacings = found["noise"] / found["spacing"]
+    return f"{figure(found['noise'])} ({found['noise_share_of_diagonal']:.3%} of the diagonal, {spacings:.2g} spacings)"
 
 
 def _suggestion(path: Path, found: dict[str, Any]) -> str:

@@ -84,7 +84,7 @@ def _rows_that_differ(values: Any, other: Any) -> Any:
     import numpy as np
 
     as_bytes = [np.ascontiguousarray(column.astype(column.dtype.newbyteorder("="))) for column in (values, other)]
-    rows = [column.reshape(len(column), -1).view(np.uint8) for column in as_bytes]
+    rows = [column.view(np.uint8).reshape(len(column), column.dtype.itemsize) for column in as_bytes]
     return (rows[0] != rows[1]).any(axis=1)
 
 

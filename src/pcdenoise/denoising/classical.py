@@ -81,15 +81,15 @@ def bilateral(
     Digne and de Franchis, "The Bilateral Filter for Point Clouds" (IPOL 2017): weights exp(-d² / 2σ_d² - h² / 2σ_n²) in a ball,
     d the distance and h the height over the tangent plane; its normal is the PCA normal of the ball. Lengths are in the points'
     unit. By default radius = max(4 noise stds, 4 spacings), σ_d = radius / 2, σ_n = 3 noise stds; the noise is measured once.
-    Of a ball with more than `max_neighbours` points the nearest count. Points too few to measure stay where they are.
-    Raises UsageError unless every argument is above 0.
+    Of a ball with more than `max_neighbours` points the nearest count. Without measurable noise (too few points, exact planes)
+    there is no default, and points stay where they are. Raises UsageError unless every argument is above 0.
     """
     if radius is None or sigma_n is None:
         level = noise_level.estimate(points, threads=threads)
-        if level.spacing == 0:
+        if level.std == 0:
             return points.copy()
         radius = max(4 * level.std, 4 * level.spacing) if radius is None else radius
-        sigma_n = max(3 * level.std, 1e-3 * radius) if sigma_n is None else sigma_n
+        sigma_n = 3 * level.std if sigma_n is None else sigma_n
     sigma_d = radius / 2 if sigma_d is None else sigma_d
     for name, length in (("radius", radius), ("sigma_d", sigma_d), ("sigma_n", sigma_n)):
         if not length > 0:

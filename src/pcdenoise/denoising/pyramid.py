@@ -20,7 +20,6 @@ from pcdenoise.cloud.neighbours import Indices, NeighbourSearch, coordinate_hash
 from pcdenoise.cloud.noise_level import NoiseLevel
 from pcdenoise.cloud.scan import Points
 from pcdenoise.errors import ModelError
-from pcdenoise.errors import ModelError
 from pcdenoise.networks.projection import (
     Edges,
     Planes,

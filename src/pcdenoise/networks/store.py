@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -35,7 +35,7 @@ class _Settings(BaseModel):
 
     channels: int = Field(ge=4, le=256)
     neighbours: int = Field(ge=6, le=256)
-    rounds: tuple[int, ...] = Field(min_length=1, max_length=8)
+    rounds: tuple[Annotated[int, Field(ge=1, le=8)], ...] = Field(min_length=1, max_length=8)
     landing_rounds: int = Field(ge=1, le=8)
 
 
