@@ -20,7 +20,7 @@ _SURFACE_ASPECT = 3.8
 
 A ball that is filled with noise has 2.3 to 2.9 at any size, a disc of radius R under noise std has R / std.
 """
-_CERTAIN_ASPECT, _SMALL_SHARE = 4.4, 1 / 16
+_CERTAIN_ASPECT, _SMALL_SHARE = 4.4, 1 / 40
 """A surface shows in a small share of the cloud, or more clearly than a solid ball, cube or blob ever does: those have up to 4.3,
 once a neighbourhood is half of them."""
 _CLEARER_SHARE = 0.3  # this share of all places must show it: edges and thin parts stay thick at any scale

@@ -1,0 +1,179 @@
+"""The prior's targets against their closed form on planes and spheres, and the losses against what they must converge to."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from pcdenoise.errors import UsageError
+from pcdenoise.learning.losses import annealed_exponent, annealed_l0, anti_clustering
+from pcdenoise.learning.priors import ALPHA, KERNELS, gaussian_std, sample_rows, sample_targets
+
+RADIUS = 0.05
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(11)
+
+
+def plane(rng: np.random.Generator, n: int, noise: float = 0.0) -> np.ndarray:
+    return np.column_stack([rng.random((n, 2)), noise * rng.normal(size=n)])
+
+
+def sphere(rng: np.random.Generator, n: int, radius: float) -> np.ndarray:
+    directions = rng.normal(size=(n, 3))
+    return radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def inner(points: np.ndarray) -> np.ndarray:
+    return (np.abs(points[:, :2] - 0.5) < 0.5 - RADIUS).all(axis=1)
+
+
+@pytest.mark.parametrize("noise", [0.005, 0.01, 0.015])
+def test_the_mean_target_on_a_plane_keeps_the_known_share_of_the_noise(rng: np.random.Generator, noise: float) -> None:
+    points = plane(rng, 30_000, noise)
+    keep = inner(points)
+    height, target = points[keep, 2], sample_targets(points, None, RADIUS, rng=rng)[keep, 2]
+    slope = (height * target).sum() / (height**2).sum()
+    std = gaussian_std(RADIUS)
+    # 24 000 targets, each with a spread of about the noise itself around its mean: the slope is known to 0.007.
+    assert slope == pytest.approx(noise**2 / (noise**2 + std**2), abs=0.03)
+
+
+@pytest.mark.parametrize("ball_radius", [0.2, 0.4])
+def test_the_mean_target_on_a_sphere_drifts_inward_by_the_curvature_times_the_kernels_variance(
+    rng: np.random.Generator, ball_radius: float
+) -> None:
+    points = sphere(rng, 30_000, ball_radius)
+    outward = points / ball_radius
+    drift = ((points - sample_targets(points, None, RADIUS, rng=rng)) * outward).sum(axis=1).mean()
+    assert drift == pytest.approx(gaussian_std(RADIUS) ** 2 / ball_radius, rel=0.05)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("thin", [False, True])
+def test_every_kernel_draws_from_its_own_law_in_the_plane(rng: np.random.Generator, kernel: str, thin: bool) -> None:
+    points = plane(rng, 40_000 if thin else 8_000)
+    keep = inner(points)
+    moved = sample_targets(points, None, RADIUS, kernel, rng=rng)[keep] - points[keep]
+    t = (np.arange(10_000) + 0.5) / 10_000 * RADIUS
+    chance = KERNELS[kernel]((t / (ALPHA[kernel] * RADIUS)) ** 2) * t
+    # 8 000 points have 63 neighbours within the radius and all are candidates; of 314 a fifth are, drawn anew at every call.
+    assert (moved**2).sum(axis=1).mean() == pytest.approx((chance * t**2).sum() / chance.sum(), rel=0.06)
+    assert np.linalg.norm(moved, axis=1).max() <= RADIUS
+
+
+def test_a_wider_kernel_moves_targets_farther_in_proportion(rng: np.random.Generator) -> None:
+    points = plane(rng, 20_000)
+    keep = inner(points)
+    spread = [sample_targets(points, None, RADIUS, alpha=alpha, rng=rng)[keep] - points[keep] for alpha in (0.15, 0.3)]
+    assert spread[1].std() / spread[0].std() == pytest.approx(2, rel=0.05)
+
+
+def test_the_law_does_not_depend_on_unit_or_place(rng: np.random.Generator) -> None:
+    points = plane(rng, 2000, 0.01)
+    rows = sample_rows(points, None, RADIUS, rng=np.random.default_rng(5))
+    np.testing.assert_array_equal(rows, sample_rows(points * 1e3, None, RADIUS * 1e3, rng=np.random.default_rng(5)))
+    assert (rows != sample_rows(points, None, RADIUS, rng=np.random.default_rng(6))).mean() > 0.5
+
+
+def test_colour_keeps_targets_on_their_side_of_an_edge(rng: np.random.Generator) -> None:
+    points = plane(rng, 20_000)
+    red = points[:, 0] < 0.5
+    colour = np.column_stack([red, np.zeros(20_000), ~red]).astype(float)
+    near = np.abs(points[:, 0] - 0.5) < 0.005
+    crossed = {
+        beta: (red[sample_rows(points, features, RADIUS, beta=beta, rng=rng)] != red)[near].mean()
+        for beta, features in ((4.0, colour), (0.6, colour), (1.0, None))
+    }
+    # The far side's weight falls by exp(-β² |Δc|² / 2·0.32), |Δc|² = 2: its odds of one to one (nearly) do too.
+    odds = crossed[1.0] / (1 - crossed[1.0]) * np.exp(-(0.6**2) * 2 / 0.64)
+    assert crossed[1.0] > 0.35
+    assert crossed[0.6] == pytest.approx(odds / (1 + odds), rel=0.15)
+    assert crossed[4.0] == 0
+
+
+def test_the_blind_spot_and_the_chance_of_being_ones_own_target(rng: np.random.Generator) -> None:
+    points = plane(rng, 8_000)
+    keep = inner(points)
+    own = np.mean([(sample_rows(points, None, RADIUS, rng=rng) == np.arange(8_000))[keep] for _ in range(5)])
+    t = (np.arange(10_000) + 0.5) / 10_000 * RADIUS
+    others = 8_000 * 2 * np.pi * (KERNELS["gaussian"]((t / (ALPHA["gaussian"] * RADIUS)) ** 2) * t).sum() * RADIUS / 10_000
+    peak = KERNELS["gaussian"](np.zeros(1))[0]
+    assert own == pytest.approx(peak / (peak + others), rel=0.1)
+    assert not (sample_rows(points, None, RADIUS, rng=rng, blind_spot=True) == np.arange(8_000)).any()
+
+
+def test_lonely_points_and_tiny_clouds_are_their_own_targets(rng: np.random.Generator) -> None:
+    for n in (0, 1, 3):
+        points = np.arange(3.0 * n).reshape(n, 3)
+        for blind in (False, True):
+            np.testing.assert_array_equal(sample_targets(points, None, RADIUS, rng=rng, blind_spot=blind), points)
+
+
+def test_wrong_arguments_are_named(rng: np.random.Generator) -> None:
+    for arguments, name in (({"kernel": "box"}, "kernel"), ({"alpha": 0.0}, "alpha"), ({"beta": -1.0}, "beta")):
+        with pytest.raises(UsageError, match=rf"^{name}: .+"):
+            sample_rows(np.zeros((3, 3)), None, RADIUS, **arguments, rng=rng)
+
+
+def minimiser(values: np.ndarray, exponent: float, **options: float) -> float:
+    grid = torch.linspace(-1, 3, 801, dtype=torch.float64)
+    samples = torch.tensor(values)
+    cost = [annealed_l0(samples, torch.stack([x, x * 0, x * 0]).expand_as(samples), exponent, **options) for x in grid]
+    return float(grid[int(torch.stack(cost).argmin())])
+
+
+def test_the_loss_converges_to_the_mean_then_the_median_then_the_mode(rng: np.random.Generator) -> None:
+    skewed = rng.exponential(size=4001)
+    skewed[:400] = rng.normal(0.1, 0.005, 400)
+    values = np.column_stack([skewed, np.zeros((4001, 2))])
+    assert minimiser(values, 2.0) == pytest.approx(skewed.mean(), abs=0.01)
+    assert minimiser(values, 1.0) == pytest.approx(np.median(skewed), abs=0.01)
+    assert minimiser(values, 0.1, epsilon=0.005) == pytest.approx(0.1, abs=0.01)
+    assert [annealed_exponent(t) for t in (0.0, 0.5)] == [2.0, 1.0]
+    assert 0 < annealed_exponent(1.0) < 1e-6
+
+
+def test_the_loss_is_invariant_to_rotation_and_its_per_axis_form_is_not(rng: np.random.Generator) -> None:
+    a, b = (torch.tensor(rng.normal(size=(200, 3))) for _ in range(2))
+    turn = torch.tensor(np.linalg.qr(rng.normal(size=(3, 3)))[0])
+    for exponent in (2.0, 1.0, 0.3):
+        torch.testing.assert_close(annealed_l0(a @ turn, b @ turn, exponent), annealed_l0(a, b, exponent))
+        relative = annealed_l0(a @ turn, b @ turn, exponent, per_axis=True) / annealed_l0(a, b, exponent, per_axis=True)
+        assert (abs(float(relative) - 1) < 1e-6) == (exponent == 2.0)
+    torch.testing.assert_close(annealed_l0(a, b, 2.0), annealed_l0(a, b, 2.0, per_axis=True), rtol=1e-6, atol=0)
+
+
+def test_losses_have_finite_gradients_where_prediction_and_target_meet() -> None:
+    prediction = torch.zeros(5, 3, requires_grad=True)
+    total = annealed_l0(prediction, torch.zeros(5, 3), 0.5, epsilon=1e-3) + anti_clustering(prediction, np.zeros((5, 3)), 1.0)
+    total.backward()
+    assert prediction.grad is not None
+    assert prediction.grad.isfinite().all()
+
+
+def test_anti_clustering_is_the_mean_distance_to_the_farthest_of_the_patch(rng: np.random.Generator) -> None:
+    points, moved = rng.random((300, 3)), rng.random((300, 3))
+    near = np.linalg.norm(points[:, None] - points, axis=2) <= 0.3
+    apart = np.where(near, np.linalg.norm(moved[:, None] - moved, axis=2), 0).max(axis=1)
+    prediction = torch.tensor(moved)
+    assert float(anti_clustering(prediction, points, 0.3)) == pytest.approx(apart.mean())
+    released = anti_clustering(prediction, points, 0.3, released_exponent=0.5)
+    assert float(released) == pytest.approx((apart**2).mean() * 0.3**-1.5)
+
+
+def test_descending_on_anti_clustering_evens_out_spacing(rng: np.random.Generator) -> None:
+    x = np.sort(rng.random(60))
+    x[20:40] = x[30] + 0.02 * (x[20:40] - x[30])  # a clump
+    points = np.column_stack([x, np.zeros((60, 2))])
+    prediction = torch.tensor(points, requires_grad=True)
+    loss = anti_clustering(prediction, points, 0.2)
+    loss.backward()
+    assert prediction.grad is not None
+    with torch.no_grad():
+        moved = prediction - 0.01 * prediction.grad
+    assert float(anti_clustering(moved, points, 0.2)) < float(loss)
+    assert prediction.grad.sum(dim=0).abs().max() < 1e-12  # both ends of each distance move: the whole stays where it is
