@@ -14,7 +14,7 @@ from pcdenoise.evaluation.chamfer import UNITS, evaluate, face_distances, point_
 from pcdenoise.synthesis.meshes import Mesh
 from pcdenoise.synthesis.shapes import sphere
 
-pytest.importorskip("open3d")
+pytest.importorskip("open3d", exc_type=ImportError)
 
 DATA = Path(os.environ.get("PCDENOISE_DATA", Path(__file__).parents[2] / "shared" / "data"))
 BENCH = DATA.parent / "bench"

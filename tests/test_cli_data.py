@@ -53,6 +53,7 @@ def test_every_law_of_noise_has_its_name_on_the_command_line() -> None:
 
 
 def test_synth_samples_a_mesh_keeps_a_copy_and_scans_it_with_the_lidar(tmp_path: Path) -> None:
+    pytest.importorskip("open3d", exc_type=ImportError)
     mesh, folder = tmp_path / "tetra.obj", tmp_path / "data"
     mesh.write_text(TETRAHEDRON)
     assert main(["synth", str(mesh), "-o", str(folder), "--points", "300", "--levels", "0", "-q"]) == 0

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from pcdenoise.synthesis.lidar import ELEVATIONS_DEG, LidarScan, scan_mesh
 from pcdenoise.synthesis.meshes import Mesh, sample_mesh
 
-pytest.importorskip("open3d")
+pytest.importorskip("open3d", exc_type=ImportError)
 
 
 @pytest.fixture(scope="module")

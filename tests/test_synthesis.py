@@ -194,7 +194,7 @@ def test_quads_of_an_obj_become_triangles_of_the_same_outward_area(cube_mesh: me
 
 @pytest.mark.parametrize("suffix", [".ply", ".off", ".stl"])
 def test_the_same_cube_is_read_from_every_format(suffix: str, cube_mesh: meshes.Mesh, tmp_path: Path) -> None:
-    open3d = pytest.importorskip("open3d")
+    open3d = pytest.importorskip("open3d", exc_type=ImportError)
     written = open3d.geometry.TriangleMesh(
         open3d.utility.Vector3dVector(cube_mesh.vertices), open3d.utility.Vector3iVector(cube_mesh.faces)
     )
@@ -240,7 +240,7 @@ def test_mesh_samples_are_exactly_n_even_points_on_the_faces_with_their_normals(
 
 def test_what_lies_inside_another_body_is_not_sampled(tmp_path: Path) -> None:
     """Two unit cubes that overlap in a cube of side one half."""
-    pytest.importorskip("open3d")
+    pytest.importorskip("open3d", exc_type=ImportError)
     (tmp_path / "two.obj").write_text(cube_obj((0, 0, 0), (0.5, 0.5, 0.5)))
     points = meshes.sample_mesh(meshes.load_mesh(tmp_path / "two.obj"), 4000, np.random.default_rng(2)).points
     in_first = ((points > 1e-4) & (points < 1 - 1e-4)).all(axis=1)

@@ -221,7 +221,7 @@ class _Looking:
                 mine = own.block(block)
                 edge, a, b = self._features(graph, mine, theirs)
                 message, news = layer(edge, graph, before[block], heard)  # noqa: B023
-                step = stage.step(message, graph, mine, theirs, a, b) if last else message[:0]  # noqa: B023
+                step = stage.step(message, graph, mine, theirs, a, b) if last else torch.zeros(0, 3)  # noqa: B023
                 on_block(block.stop - block.start)
                 return news, step
 
