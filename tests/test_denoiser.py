@@ -289,7 +289,7 @@ def test_every_pass_is_a_step_and_the_last_one_is_the_result(fine: Cloud, fine_r
     np.testing.assert_array_equal(steps[0].points, fine_result.points)
     np.testing.assert_array_equal(steps[-1].points, clean(fine.noisy, iters=3).points)
     for before, after in pairwise(steps):
-        assert after.figures["noise_before"] == before.figures["noise_after"]
+        assert after.figures["roughness_before"] == before.figures["roughness_after"]
         assert np.abs(after.points - before.points).max() > 0
     assert steps[0].figures["move_max"] == pytest.approx(moves(fine.noisy, steps[0].points).max(), rel=1e-9)
 

@@ -165,11 +165,11 @@ class _Cleaning:
 
 
 def _notes(result: Result) -> tuple[str, str]:
-    """The noise before the first pass and after the last, for a picture."""
+    """The roughness before the first pass and after the last, for a picture."""
     if not result.steps:
         return "", "nothing moved"
-    before, after = result.steps[0].figures["noise_before"], result.steps[-1].figures["noise_after"]
-    return f"noise {figure(before)}", f"noise {figure(after)}"
+    before, after = result.steps[0].figures["roughness_before"], result.steps[-1].figures["roughness_after"]
+    return f"roughness {figure(before)}", f"roughness {figure(after)}"
 
 
 def _summary(figures: Figures) -> str:

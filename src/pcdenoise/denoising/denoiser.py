@@ -39,7 +39,11 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Step:
-    """The cloud after one pass, and its figures: iteration, noise_before, noise_after, move_median, move_max (input's unit)."""
+    """The cloud after one pass, and its figures: iteration, move_median, move_max, roughness_before and roughness_after.
+
+    Roughness is the estimated noise: what neighbours disagree by. After a pass it says how smooth the cloud is, not how far it
+    still is from the truth, which nobody knows.
+    """
 
     points: Points
     figures: dict[str, Any]
@@ -150,8 +154,8 @@ def _passes(cloud: _Cloud, model: Model | None, config: DenoiseConfig, on_progre
         length = np.linalg.norm(moved - points, axis=1)
         figures = {
             "iteration": number,
-            "noise_before": level.std,
-            "noise_after": after.std,
+            "roughness_before": level.std,
+            "roughness_after": after.std,
             "move_median": float(np.median(length)),
             "move_max": float(length.max()),
         }
