@@ -45,3 +45,8 @@ class BatchError(PcdenoiseError):
     """Some inputs of a batch failed; the others are done."""
 
     exit_code = 1
+
+
+def in_one_line(fault: BaseException) -> str:
+    """What another library's error says, without line breaks and at most 160 characters, to be put into one of ours."""
+    return " ".join(str(fault).split())[:160]

@@ -1,4 +1,4 @@
-"""A scan in memory and the local frame it is worked on in. Not here: files (io), neighbours (neighbours.py)."""
+"""A scan in memory. Not here: files (io), neighbours (neighbours.py)."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from pcdenoise.errors import ScanError
 
 Points = NDArray[np.float64]
 """(N, 3) world coordinates."""
-LocalPoints = NDArray[np.float32]
-"""(N, 3) coordinates in a Frame."""
 Mask = NDArray[np.bool_]
 """(N,) per-point truth values."""
 
@@ -64,23 +62,3 @@ class Scan:
         """The scan with new per-point columns, written as LAS extra bytes, PLY properties, text columns or PCD fields."""
         added = self.added + tuple(name for name in values if name not in self.added)
         return replace(self, attributes={**self.attributes, **values}, added=added)
-
-
-@dataclass(frozen=True)
-class Frame:
-    """A shift and a scale between world (float64) and local (float32) coordinates: local = (world - origin) / unit.
-
-    One float32 step at UTM northings is half a metre; from a nearby origin it is below a thousandth of any scanner's noise.
-    """
-
-    origin: NDArray[np.float64]
-    unit: float = 1.0
-
-    def to_local(self, points: Points) -> LocalPoints:
-        """(N, 3) world to (N, 3) local."""
-        return ((points - self.origin) / self.unit).astype(np.float32)
-
-    def to_world(self, points: LocalPoints) -> Points:
-        """(N, 3) local to (N, 3) world."""
-        world: Points = points.astype(np.float64) * self.unit + self.origin
-        return world

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pcdenoise.commands import options
 from pcdenoise.commands.console import Console
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 NoiseName = Literal[
     "gaussian", "anisotropic", "rays", "laplace", "heavy-tailed", "beam-bias", "quantised", "misregistered", "lidar"
 ]
-NOISE_NAMES = get_args(NoiseName)
 """The laws of synthesis.noise, and the scanner of synthesis.lidar."""
 
 

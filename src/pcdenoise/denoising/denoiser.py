@@ -20,7 +20,7 @@ from pcdenoise.cloud.neighbours import distinct, spatial_order
 from pcdenoise.cloud.noise_level import NoiseLevel, estimate
 from pcdenoise.cloud.scan import Mask, Points
 from pcdenoise.config import DenoiseConfig
-from pcdenoise.denoising import classical
+from pcdenoise.denoising import classical, outliers
 from pcdenoise.denoising.relaxation import relax, within
 from pcdenoise.errors import UsageError
 from pcdenoise.networks.store import Model
@@ -69,16 +69,10 @@ def denoise(points: Points, model: Model | None, config: DenoiseConfig, on_progr
     cloud = _Cloud(points, config)
     found = np.zeros(len(points), dtype=bool)
     if config.outliers != "keep" and len(cloud.start) >= FEWEST_POINTS:
-        from pcdenoise.denoising import outliers
-
         found = cloud.to_rows(outliers.find(cloud.start, threads=cloud.threads), False)
     steps = list(_passes(cloud, model, config, on_progress or (lambda _task, _share: None)))
     moved = steps[-1].points if steps else cloud.start
-    result = points.copy()
-    result[cloud.finite] = cloud.to_rows(moved, np.nan)[cloud.finite]
-    still: Mask = np.logical_and.reduce(moved == cloud.start, axis=1)
-    unmoved = cloud.to_rows(still, True)
-    result[unmoved] = points[unmoved]
+    unmoved = cloud.unmoved(moved)
     length = np.linalg.norm(moved - cloud.start, axis=1) if len(moved) else np.zeros(1)
     figures = {
         "noise": cloud.level.std,
@@ -93,21 +87,22 @@ def denoise(points: Points, model: Model | None, config: DenoiseConfig, on_progr
         "points_coincident": int(cloud.finite.sum()) - len(cloud.start),
         "outliers": int(found.sum()),
     }
-    return Result(result, found, unmoved, figures, [Step(cloud.placed(points, s.points), s.figures) for s in steps])
+    placed = [Step(cloud.placed(step.points), step.figures) for step in steps]
+    return Result(placed[-1].points if placed else points.copy(), found, unmoved, figures, placed)
 
 
 def iterate(points: Points, model: Model | None, config: DenoiseConfig) -> Iterator[Step]:
     """Pass after pass, each fed with the last one's output: (N, 3) points and figures of every step."""
     cloud = _Cloud(points, config)
     for step in _passes(cloud, model, config, lambda _task, _share: None):
-        yield Step(cloud.placed(points, step.points), step.figures)
+        yield Step(cloud.placed(step.points), step.figures)
 
 
 class _Cloud:
     """The distinct finite points of an input in spatial order around their own origin, and the way back to its rows."""
 
     def __init__(self, points: Points, config: DenoiseConfig) -> None:
-        self.config = config
+        self.config, self.rows = config, points
         self.threads = config.threads or os.cpu_count() or 1
         self.finite: Mask = np.logical_and.reduce(np.isfinite(points), axis=1)
         usable = points[self.finite]
@@ -127,11 +122,14 @@ class _Cloud:
         rows[self.finite] = values[self._row] + self.origin if values.ndim == 2 else values[self._row]
         return rows
 
-    def placed(self, points: Points, moved: Points) -> Points:
-        """(N, 3) input rows at their new places."""
-        rows = points.copy()
-        rows[self.finite] = self.to_rows(moved, np.nan)[self.finite]
-        return rows
+    def unmoved(self, moved: Points) -> Mask:
+        """(N,) input rows that stay where they are."""
+        still: Mask = np.logical_and.reduce(moved == self.start, axis=1)
+        return self.to_rows(still, True)
+
+    def placed(self, moved: Points) -> Points:
+        """(N, 3) input rows at their new places; those that stay keep every bit, which the way over the origin may cost."""
+        return np.where(self.unmoved(moved)[:, None], self.rows, self.to_rows(moved, np.nan))
 
     def limited(self, moved: Points) -> Points:
         """Moves scaled by the strength and cut to the longest that is allowed."""

@@ -163,8 +163,6 @@ class _Looking:
     def __init__(
         self, points: Tensor, sources: Tensor, count: Tensor | None, k: int, noise: float, block_points: int, threads: int
     ) -> None:
-        if not sources.isfinite().all():
-            raise ModelError("the network gave positions that are not numbers; use another model or --method jet")
         self.points, self.sources, self.count, self.noise, self.threads = points, sources, count, noise, threads
         index = NeighbourSearch(sources.detach().numpy(), threads).knn(points.detach().numpy(), k)[1]
         self.index = torch.from_numpy(index.astype(np.int32))

@@ -21,7 +21,7 @@ from pcdenoise.denoising.pyramid import coarsen, share_of_seeds
 from pcdenoise.errors import UsageError
 from pcdenoise.synthesis import noise
 from pcdenoise.synthesis.meshes import MESH_SUFFIXES, load_mesh, sample_mesh
-from pcdenoise.synthesis.shapes import random_surface
+from pcdenoise.synthesis.shapes import in_unit_sphere, random_surface
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -205,9 +205,7 @@ def _procedural(seed: int, number: int) -> tuple[Array, Array]:
 
 def _from_mesh(path: Path) -> tuple[Array, Array]:
     sample = sample_mesh(load_mesh(path), N_DENSE, np.random.default_rng(0))
-    middle = (sample.points.max(axis=0) + sample.points.min(axis=0)) / 2
-    points = sample.points - middle
-    return points / np.linalg.norm(points, axis=1).max(), sample.normals
+    return in_unit_sphere(sample.points), sample.normals
 
 
 class CloudSource:

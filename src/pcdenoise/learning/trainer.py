@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from pcdenoise.config import TrainConfig
-from pcdenoise.errors import ModelError, UsageError
+from pcdenoise.errors import ModelError, UsageError, in_one_line
 from pcdenoise.learning.dataset import CloudSource, TrainingCloud, surfaces_from
 from pcdenoise.learning.supervised import supervised_loss
 from pcdenoise.networks import store
@@ -117,8 +117,7 @@ class _Run:
     @property
     def recent_error(self) -> float:
         """Mean error of the last hundred clouds, infinite before the first."""
-        recent = self._errors[-100:]
-        return sum(recent) / len(recent) if recent else math.inf
+        return sum(self._errors) / len(self._errors) if self._errors else math.inf
 
     @property
     def summary(self) -> TrainingSummary:
@@ -183,9 +182,8 @@ class _Run:
             self.network.load_state_dict(_part(tensors, "network."))
             self.average.load_state_dict(_part(tensors, "average."))
         except (SafetensorError, RuntimeError, KeyError, ValueError) as fault:
-            raise ModelError(
-                f"{path}: not a checkpoint of this run ({fault}); leave --resume out to start again".replace("\n", " ")
-            ) from None
+            said = in_one_line(fault)
+            raise ModelError(f"{path}: not a checkpoint of this run ({said}); leave --resume out to start again") from None
         for name, parameter in self.network.named_parameters():
             state = {key: tensors[f"{key}.{name}"] for key in ("step", "exp_avg", "exp_avg_sq") if f"{key}.{name}" in tensors}
             if state:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from pcdenoise.errors import ModelError
+from pcdenoise.errors import ModelError, in_one_line
 
 if TYPE_CHECKING:
     from pcdenoise.networks.projection import ProjectionNetwork
@@ -102,11 +102,11 @@ def load(name_or_folder: str | Path = DEFAULT) -> Model:
     try:
         tensors = parse(data)
     except (SafetensorError, ValueError, KeyError) as fault:
-        raise ModelError(f"{path}: not a safetensors file ({_first_line(fault)}); copy the model folder again") from None
+        raise ModelError(f"{path}: not a safetensors file ({in_one_line(fault)}); copy the model folder again") from None
     try:
         network.load_state_dict(tensors)
     except RuntimeError as fault:
-        raise ModelError(f"{path}: weights do not fit {CONFIG} ({_first_line(fault)}); copy the model folder again") from None
+        raise ModelError(f"{path}: weights do not fit {CONFIG} ({in_one_line(fault)}); copy the model folder again") from None
     if not all(bool(t.isfinite().all()) for t in tensors.values()):
         raise ModelError(f"{path}: weights are not all numbers; copy the model folder again")
     return Model(folder.name, network.eval(), config, hashlib.sha256(data).hexdigest())
@@ -162,14 +162,10 @@ def _read_config(folder: Path) -> ModelConfig:
     try:
         return ModelConfig.model_validate(json.loads(_read(path)))
     except (ValidationError, ValueError, RecursionError) as fault:
-        raise ModelError(f"{path}: not a model's config ({_first_line(fault)}); copy the model folder again") from None
+        raise ModelError(f"{path}: not a model's config ({in_one_line(fault)}); copy the model folder again") from None
 
 
 def _build(config: ModelConfig) -> ProjectionNetwork:
     from pcdenoise.networks.projection import ProjectionConfig, ProjectionNetwork
 
     return ProjectionNetwork(ProjectionConfig(**config.settings.model_dump()))
-
-
-def _first_line(fault: BaseException) -> str:
-    return " ".join(str(fault).split())[:160]

@@ -92,10 +92,11 @@ def random_surface(rng: np.random.Generator, n_samples: int) -> SurfaceSample:
     of the others cut open).
     """
     points, normals = random_body(rng).sample(n_samples, rng)
-    return SurfaceSample(_in_unit_sphere(points), normals)
+    return SurfaceSample(in_unit_sphere(points), normals)
 
 
-def _in_unit_sphere(points: Vectors) -> Vectors:
+def in_unit_sphere(points: Vectors) -> Vectors:
+    """(N, 3) points, moved and scaled alike so that their box is centred and the furthest is at distance 1."""
     centred: Vectors = points - (points.max(axis=0) + points.min(axis=0)) / 2
     centred /= np.linalg.norm(centred, axis=1).max()
     return centred
