@@ -37,9 +37,12 @@ class TrainConfig(Settings):
     method: Literal["supervised"] = Field("supervised", description="Signal; supervised: surfaces that are known exactly.")
     network: Literal["projection"] = Field("projection", description="Architecture.")
     channels: int = Field(32, ge=4, le=256, description="Features per point.")
+    neighbours: int = Field(32, ge=6, le=256, description="Neighbours that a point looks at.")
     rounds: tuple[int, ...] = Field((2, 2), min_length=1, description="Rounds of messages in each stage.")
     landing_rounds: int = Field(2, ge=1, le=8, description="Rounds of messages in which all points land on the seeds' surface.")
-    n_surfaces: int = Field(400, ge=1, description="Different procedural surfaces to learn from.")
+    data: tuple[str, ...] = Field(
+        ("shapes:400",), min_length=1, description="What to learn from: shapes:N, meshes, folders of meshes; each as often."
+    )
     steps: int | None = Field(None, ge=1, description="Clouds to learn from; or give a budget.")
     budget_s: float | None = Field(None, gt=0, description="Seconds to learn for; or give steps.")
     learning_rate: float = Field(3e-3, gt=0, le=1, description="Peak learning rate; it warms up and decays to a hundredth.")

@@ -10,7 +10,7 @@ from pcdenoise.commands import options
 from pcdenoise.commands.console import Console
 from pcdenoise.commands.files import refuse_existing
 from pcdenoise.commands.options import configured, option
-from pcdenoise.errors import ScanError, UsageError
+from pcdenoise.errors import UsageError
 
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
@@ -18,16 +18,18 @@ _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 def train(
     output: Annotated[Path, option("--output", "-o", metavar="DIR", help="The model folder to write.")],
     data: Annotated[
-        list[str] | None,
+        list[str],
         option(
             "--data",
-            metavar="DIR",
+            metavar="SOURCE",
             envvar="PCDENOISE_TRAIN_DATA",
-            help="Meshes, folders of meshes, synth folders; endless procedural shapes if not given.",
+            help="shapes:N (procedural), a mesh, a folder of meshes or one made by synth; repeat to mix. Default: shapes:400.",
         ),
-    ] = None,
+    ] = ["shapes:400"],  # noqa: B006
     method: Annotated[Literal["supervised"], option("--method", help="What the model learns from.")] = "supervised",
     network: Annotated[Literal["projection"], option("--network", help="The network's form.")] = "projection",
+    neighbours: Annotated[int, option("--neighbours", help="How many neighbours a point looks at.")] = 32,
+    learning_rate: Annotated[float, option("--learning-rate", help="The highest; it warms up and decays to a hundredth.")] = 3e-3,
     steps: Annotated[int | None, option("--steps", min=1, help="Stop after so many steps.")] = None,
     budget: Annotated[str | None, option("--budget", metavar="TIME", help="Stop after so long: 90s, 20m, 1.5h.")] = None,
     init: Annotated[str | None, option("--init", metavar="NAME|DIR", help="Start from this model.")] = None,
@@ -46,23 +48,14 @@ def train(
     from pcdenoise.learning import trainer
 
     settings = configured(
-        TrainConfig, method=method, network=network, steps=steps, budget_s=_seconds(budget), seed=seed, threads=threads
-    )
+        TrainConfig, data=data, method=method, network=network, neighbours=neighbours, learning_rate=learning_rate,
+        steps=steps, budget_s=_seconds(budget), seed=seed, threads=threads,
+    )  # fmt: skip
     refuse_existing([output / "config.json"], overwrite or resume)
     console = Console(quiet)
     with console.progress("train") as on_progress:
-        summary = trainer.train(
-            _existing(data) if data else None, settings, output, init=init, resume=resume, on_progress=on_progress
-        )
+        summary = trainer.train(settings, output, init=init, resume=resume, on_progress=on_progress)
     console.note(f"{output}: {summary}")
-
-
-def _existing(names: list[str]) -> list[Path]:
-    paths = [Path(name) for name in names]
-    for path in paths:
-        if not path.exists():
-            raise ScanError(f"{path}: no such file or folder; check --data")
-    return paths
 
 
 def _seconds(text: str | None) -> float | None:

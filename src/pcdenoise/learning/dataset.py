@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -18,7 +19,7 @@ from scipy.spatial import cKDTree
 from pcdenoise.cloud.neighbours import spatial_order
 from pcdenoise.cloud.noise_level import estimate
 from pcdenoise.denoising.pyramid import coarsen, share_of_seeds
-from pcdenoise.errors import UsageError
+from pcdenoise.errors import ScanError, UsageError
 from pcdenoise.synthesis import noise
 from pcdenoise.synthesis.meshes import MESH_SUFFIXES, load_mesh, sample_mesh
 from pcdenoise.synthesis.shapes import in_unit_sphere, random_surface
@@ -50,6 +51,7 @@ class TrainingCloud:
 
     seeds (M, 3), count (M,); raw (F, 3): points that land on the seeds. Where every point is its own seed, both are None.
     surface (S, 3), normals (S, 3): the true surface. seed_judged (M,): seeds of the surface, far enough from the cut.
+    covered (C, 3), covered_normals (C, 3): samples of the surface that final points should come close to.
     judged, clutter (F,): final points far enough from the cut, and those that belong to no surface and should stay.
     noise: estimated standard deviation; scale: what errors are divided by.
     """
@@ -59,6 +61,8 @@ class TrainingCloud:
     raw: Array | None
     surface: Array
     normals: Array
+    covered: Array
+    covered_normals: Array
     seed_judged: Mask
     judged: Mask
     clutter: Mask
@@ -95,9 +99,11 @@ def draw_cloud(surface: Array, normals: Array, neighbours: int, rng: np.random.G
         judged: Mask = np.linalg.norm(points - centre, axis=1) < 0.75 * radius
         return judged
 
-    truth = surface[near], normals[near]
+    to_cover = np.flatnonzero(np.linalg.norm(surface - centre, axis=1) < 0.6 * radius)
+    to_cover = rng.permutation(to_cover)[:N_LANDING]
+    truth = surface[near], normals[near], surface[to_cover], normals[to_cover]
     estimated = level.std * float(np.exp(0.1 * rng.standard_normal()))
-    scale = max(std, 0.1 * level.spacing, 1e-6)
+    scale = max(std, 0.5 * level.std, 0.1 * level.spacing, 1e-6)
     if share == 1:
         judged = inside(noisy)
         return TrainingCloud(noisy, None, None, *truth, judged & ~clutter, judged, clutter, estimated, scale)
@@ -164,20 +170,29 @@ def _with_outliers(noisy: Array, clutter: Mask, rng: np.random.Generator) -> tup
 Surfaces = list[Callable[[], tuple[Array, Array]]]
 """Training surfaces, each a function that gives (S, 3) points and (S, 3) unit normals in the unit sphere."""
 
+PROCEDURAL = re.compile(r"shapes:([1-9]\d{0,5})")
+"""How a number of procedural surfaces is asked for, here and in `pcdenoise synth`."""
 
-def surfaces_from(data: list[Path] | None, n_procedural: int, seed: int, cache: Path) -> Surfaces:
-    """Procedural surfaces, or every mesh among the files in `data` (folders are searched). Raises UsageError when there is none.
 
-    Samples are kept in the folder `cache`, since sampling a surface costs more than learning from it.
+def surfaces_from(data: Sequence[str], seed: int, cache: Path) -> list[Surfaces]:
+    """One list for each of `data`: `shapes:N`, N procedural surfaces; a mesh; all meshes in a folder, searched to the bottom.
+
+    Raises UsageError for data without a mesh. Samples are kept in the folder `cache`, since sampling a surface costs more than
+    learning from it.
     """
-    if data is None:
-        return [partial(_cached, cache / f"{n}.npy", partial(_procedural, seed, n)) for n in range(n_procedural)]
-    meshes = [file for path in data for file in (sorted(path.rglob("*")) if path.is_dir() else [path])]
-    meshes = [file for file in meshes if _is_mesh(file)]
+    return [_surfaces(text, seed, cache / str(number)) for number, text in enumerate(data)]
+
+
+def _surfaces(text: str, seed: int, cache: Path) -> Surfaces:
+    cache.mkdir()
+    if asked := PROCEDURAL.fullmatch(text):
+        return [partial(_cached, cache / f"{n}.npy", partial(_procedural, seed, n)) for n in range(int(asked[1]))]
+    path = Path(text)
+    if not path.exists():
+        raise ScanError(f"{text}: no such file or folder; check --data, or give shapes:400 for procedural surfaces")
+    meshes = [file for file in (sorted(path.rglob("*")) if path.is_dir() else [path]) if _is_mesh(file)]
     if not meshes:
-        raise UsageError(
-            f"{', '.join(map(str, data))}: no mesh to learn from; give a folder of meshes, or one made by pcdenoise synth"
-        )
+        raise UsageError(f"{text}: no mesh to learn from; give a folder of meshes, shapes:400, or a folder made by pcdenoise synth")
     return [partial(_cached, cache / f"{n}.npy", partial(_from_mesh, file)) for n, file in enumerate(meshes)]
 
 
@@ -209,15 +224,19 @@ def _from_mesh(path: Path) -> tuple[Array, Array]:
 
 
 class CloudSource:
-    """An endless series of training clouds over some surfaces; the n-th depends on seed and n alone."""
+    """An endless series of training clouds over some lists of surfaces, each list as often as the others.
 
-    def __init__(self, surfaces: Surfaces, seed: int) -> None:
+    The n-th cloud depends on seed and n alone.
+    """
+
+    def __init__(self, surfaces: list[Surfaces], seed: int) -> None:
         self.surfaces, self.seed = surfaces, seed
 
     def cloud(self, number: int, neighbours: int) -> TrainingCloud:
         """The number-th cloud: one of the surfaces, turned at random, with its own density and noise."""
         rng = np.random.default_rng([self.seed, 7, number])
-        surface, normals = self.surfaces[int(rng.integers(len(self.surfaces)))]()
+        surfaces = self.surfaces[int(rng.integers(len(self.surfaces)))]
+        surface, normals = surfaces[int(rng.integers(len(surfaces)))]()
         turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
         return draw_cloud(surface @ turn, normals @ turn, neighbours, rng)
 

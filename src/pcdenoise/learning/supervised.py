@@ -46,10 +46,20 @@ def supervised_loss(network: ProjectionNetwork, cloud: TrainingCloud) -> tuple[T
     on_surface, still = torch.from_numpy(cloud.on_surface), torch.from_numpy(cloud.judged & cloud.clutter)
     error = target.error(final[on_surface]) / cloud.scale
     loss = loss + _robust(error)
+    if len(cloud.covered):
+        loss = loss + _robust(_uncovered(cloud, final[torch.from_numpy(~cloud.clutter)]) / cloud.scale)
     if still.any():
         moved = (final - start)[still].square().sum(-1).add(1e-12).sqrt() / cloud.scale
         loss = loss + 0.5 * float(still.float().mean()) * _robust(moved)
     return loss, error.square().mean()
+
+
+def _uncovered(cloud: TrainingCloud, final: Tensor) -> Tensor:
+    """(C,) height of surface samples over the final points next to them: what erodes corners, tips and thin parts."""
+    nearest = cKDTree(final.detach().numpy()).query(cloud.covered)[1]
+    away = torch.from_numpy(cloud.covered).float() - final[torch.from_numpy(nearest)]
+    height: Tensor = (away * torch.from_numpy(cloud.covered_normals).float()).sum(-1).abs()
+    return height
 
 
 def _robust(error: Tensor) -> Tensor:

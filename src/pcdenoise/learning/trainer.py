@@ -12,7 +12,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -47,7 +47,6 @@ class TrainingSummary:
 
 
 def train(
-    data: list[Path] | None,
     config: TrainConfig,
     output: Path,
     *,
@@ -55,7 +54,7 @@ def train(
     resume: bool = False,
     on_progress: Callable[[str, float], None] | None = None,
 ) -> TrainingSummary:
-    """Learns from endless procedural surfaces, or from the meshes in `data`, and writes the model folder `output`.
+    """Learns from the surfaces in `config.data` and writes the model folder `output`.
 
     The folder also gets training.jsonl, one line per fifty steps. An interrupt (Ctrl-C) saves what was learned and is passed on.
     Raises UsageError when there is nothing to resume or to learn from.
@@ -70,7 +69,7 @@ def train(
     elif (output / CHECKPOINT).exists():
         raise UsageError(f"{output}: holds an unfinished run; give --resume to go on with it, or another folder")
     with tempfile.TemporaryDirectory(prefix="pcdenoise-surfaces-") as cache:
-        source = CloudSource(surfaces_from(data, config.n_surfaces, config.seed, Path(cache)), config.seed)
+        source = CloudSource(surfaces_from(config.data, config.seed, Path(cache)), config.seed)
         try:
             for cloud in source.clouds(run.step, run.network.config.neighbours):
                 if run.progress >= 1:
@@ -85,10 +84,14 @@ def train(
 
 
 def _initial(config: TrainConfig, init: str | None) -> ProjectionNetwork:
+    """A new network, or one with the weights and sizes of another model; only the number of neighbours is free then."""
     if init is not None:
-        return copy.deepcopy(store.load(init).network).train()
+        learned = store.load(init).network
+        network = ProjectionNetwork(replace(learned.config, neighbours=config.neighbours))
+        network.load_state_dict(learned.state_dict())
+        return network
     return ProjectionNetwork(
-        ProjectionConfig(channels=config.channels, rounds=config.rounds, landing_rounds=config.landing_rounds)
+        ProjectionConfig(config.channels, config.neighbours, config.rounds, config.landing_rounds)
     )
 
 

@@ -13,6 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from pcdenoise.networks.exchange import exchange
+
 N_EDGE_FEATURES = 8
 N_POINT_FEATURES = 4
 _KERNEL_SHARE = 0.7  # the kernel's unit of length as a share of the distance to the last neighbour
@@ -176,10 +178,8 @@ class MessageRound(nn.Module):
 
     def forward(self, features: Tensor, graph: Edges, own: Tensor, heard: Tensor) -> tuple[Tensor, Tensor]:
         """Messages (M, K, C) and the points' new features (M, C). features (M, K, 8), own (M, C), heard (N, C)."""
-        hidden = self.edge(features).add_(self.own(own)[:, None]).add_(heard[graph.source]).relu_()
-        message = self.message(hidden).relu_()
-        mean = (graph.weight[:, None] @ message).squeeze(1)
-        most = (message * (graph.weight / graph.weight.amax(-1, keepdim=True).clamp_min(1e-12))[:, :, None]).amax(1)
+        layers = [(layer.weight, layer.bias) for layer in (self.edge, self.message)]
+        message, mean, most = exchange(features, self.own(own), heard, graph.source, graph.weight, *layers)
         return message, self.norm(own + self.update(torch.cat([mean, most], dim=-1)))
 
 
