@@ -1,0 +1,109 @@
+"""The network of Total Denoising: Monte Carlo convolutions over Poisson-disk levels. Not here: the convolutions (convolution.py).
+
+Hermosilla, Ritschel, Ropinski, "Total Denoising: Unsupervised Learning of 3D Point Cloud Cleaning" (2019), Implementation.
+Lengths are shares of the cloud's bounding-box diagonal, which is 1 in the network's frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from pcdenoise.cloud.sampling import poisson_disk
+from pcdenoise.cloud.scan import Points
+from pcdenoise.networks.convolution import MonteCarloConvolution, ReceptiveFields, receptive_fields
+
+FIRST_RADIUS, SECOND_RADIUS = 0.05, 0.10
+"""Receptive fields of the first and second level; their Poisson-disk radii are half of that."""
+LONGEST_MOVE = 0.05
+"""Along each axis."""
+_MOMENTUM = 0.05  # of the running statistics; the released 0.01 still remembers its start after a few hundred steps
+
+
+@dataclass(frozen=True)
+class MCConvConfig:
+    """width: channels of the first level. sampled: neighbours that stand for all, or None for all and the literal density.
+
+    Width 51 has the 25 000 parameters that the paper names; 64, as released, has 35 840.
+    """
+
+    width: int = 51
+    sampled: int | None = 48
+    dropout: float = 0.2
+
+
+PAPER = MCConvConfig()
+RELEASED = MCConvConfig(width=64, sampled=None)
+
+
+class MCConvNetwork(nn.Module):
+    """Positions to displacements: two levels down, two up, one skip. Never sees colour."""
+
+    def __init__(self, config: MCConvConfig) -> None:
+        super().__init__()
+        self.config = config
+        width = config.width
+        self.encode1 = MonteCarloConvolution(1, width)
+        self.mix1 = Mix(width, 2 * width, config.dropout)
+        self.encode2 = MonteCarloConvolution(2 * width, 2 * width, depthwise=True)
+        self.mix2 = Mix(2 * width, width, config.dropout)
+        self.decode2 = MonteCarloConvolution(width, width, depthwise=True)
+        self.mix1_again = Mix(2 * width, width, config.dropout)
+        self.decode1 = MonteCarloConvolution(width, 3)
+
+    def forward(self, points: Tensor, rng: np.random.Generator | None = None) -> Tensor:
+        """(N, 3) displacement of (N, 3) finite points in a frame in which the bounding-box diagonal is 1.
+
+        `rng` draws levels, neighbours and, in training, dropout; None draws the same ones every time. No gradient flows to the
+        positions. In training at least two points must stay on the second level.
+        """
+        if len(points) == 0:
+            return torch.zeros_like(points)
+        rng = np.random.default_rng(0) if rng is None else rng
+        fields = levels(points.detach().cpu().double().numpy(), self.config.sampled, rng)
+        down1, down2, up2, up1 = (each.to(points.device) for each in fields)
+        first = self.encode1(points.new_ones(len(points), 1), down1)  # (N1, C)
+        second = self.encode2(self.mix1(first, rng), down2)  # (N2, 2C)
+        decoded = self.decode2(self.mix2(second, rng), up2)  # (N1, C)
+        move = self.decode1(self.mix1_again(torch.cat([decoded, first], dim=1), rng), up1)  # (N, 3)
+        return LONGEST_MOVE * torch.tanh(move)
+
+
+def levels(
+    points: Points, sampled: int | None, rng: np.random.Generator
+) -> tuple[ReceptiveFields, ReceptiveFields, ReceptiveFields, ReceptiveFields]:
+    """The receptive fields of the two steps down to Poisson-disk subsets of (N, 3) points and of the two steps back up."""
+    first = points[poisson_disk(points, FIRST_RADIUS / 2, rng)]
+    second = first[poisson_disk(first, SECOND_RADIUS / 2, rng)]
+    return (
+        receptive_fields(points, first, FIRST_RADIUS, sampled, rng),
+        receptive_fields(first, second, SECOND_RADIUS, sampled, rng),
+        receptive_fields(second, first, SECOND_RADIUS, sampled, rng),
+        receptive_fields(first, points, FIRST_RADIUS, sampled, rng),
+    )
+
+
+class Mix(nn.Module):
+    """Normalise, rectify, drop; a linear map of each point's channels; the same again. Statistics are those of the one cloud."""
+
+    def __init__(self, in_channels: int, out_channels: int, dropout: float) -> None:
+        super().__init__()
+        self.before, self.after = (nn.BatchNorm1d(n, eps=1e-3, momentum=_MOMENTUM) for n in (in_channels, out_channels))
+        self.linear = nn.Linear(in_channels, out_channels)
+        self.dropout = dropout
+        nn.init.xavier_uniform_(self.linear.weight)
+        nn.init.zeros_(self.linear.bias)
+
+    def forward(self, features: Tensor, rng: np.random.Generator) -> Tensor:
+        """(M, C_out) from (M, C_in)."""
+        mixed = self.linear(self._dropped(self.before(features).relu(), rng))
+        return self._dropped(self.after(mixed).relu(), rng)
+
+    def _dropped(self, features: Tensor, rng: np.random.Generator) -> Tensor:
+        if not self.training or self.dropout == 0:
+            return features
+        kept = torch.from_numpy(rng.random(features.shape, dtype=np.float32) >= self.dropout)
+        return features * kept.to(features) / (1 - self.dropout)
