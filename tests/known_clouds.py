@@ -65,13 +65,19 @@ def moves(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 @cache
 def model(kind: str) -> Model:
-    """'untrained': the zero head, a classical filter; 'seeded': a random head, so that every weight of the network counts."""
+    """'untrained': the zero head, a classical filter; 'seeded': a random head, so that every weight of the network counts;
+    'mcconv': the paper's network with random weights."""
     import torch
 
+    from pcdenoise.networks.mcconv import PAPER, MCConvNetwork
     from pcdenoise.networks.projection import ProjectionConfig, ProjectionNetwork
 
     with torch.inference_mode(False), torch.random.fork_rng(), torch.no_grad():
         torch.manual_seed(11)
+        if kind == "mcconv":
+            network = MCConvNetwork(PAPER).eval()
+            config = ModelConfig.model_validate({"network": kind, "settings": asdict(PAPER)})
+            return Model(kind, network, config, "0" * 64)
         network = ProjectionNetwork(ProjectionConfig(landing_rounds=2)).eval()
         for stage in [*network.among, network.landing] if kind == "seeded" else []:
             stage.step.head.weight.normal_(std=0.1)

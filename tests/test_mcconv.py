@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 from scipy.stats import ncx2
 
+from pcdenoise.cloud.sampling import poisson_disk
 from pcdenoise.networks import convolution
 from pcdenoise.networks.convolution import BANDWIDTH, MonteCarloConvolution, ReceptiveFields, receptive_fields
-from pcdenoise.networks.mcconv import FIRST_RADIUS, LONGEST_MOVE, PAPER, RELEASED, SECOND_RADIUS, MCConvNetwork, levels
+from pcdenoise.networks.mcconv import FIRST_RADIUS, LONGEST_MOVE, PAPER, RELEASED, SECOND_RADIUS, MCConvNetwork
 
 RADIUS = 0.05
 
@@ -113,18 +115,30 @@ def test_the_integral_over_a_plane_does_not_depend_on_its_density(rng: np.random
         assert integrals(receptive_fields(points, centres, RADIUS, 48, rng)).mean() == pytest.approx(expected, rel=0.07)
 
 
-def test_levels_are_poisson_disks_and_edges_stay_in_their_receptive_fields(rng: np.random.Generator) -> None:
+def test_levels_are_poisson_disks_and_no_receptive_field_is_empty(rng: np.random.Generator) -> None:
     points = noisy_sphere(rng, 5_000)
-    down1, down2, up2, up1 = levels(points, 48, rng)
-    assert up1.n_targets == len(points)
-    assert up2.n_targets == down1.n_targets
-    assert 100 < down2.n_targets < down1.n_targets < len(points) / 4
+    first = network().eval().encode(torch.tensor(points), rng).points
+    second = first[poisson_disk(first, SECOND_RADIUS / 2, rng)]
+    assert 100 < len(second) < len(first) < len(points) / 4
+    assert cKDTree(first).query(first, 2)[0][:, 1].min() > FIRST_RADIUS / 2
     assert (FIRST_RADIUS, SECOND_RADIUS) == (0.05, 0.1)
-    for fields in (down1, down2, up2, up1):
+    for sources, targets, radius in ((points, first, 0.05), (first, second, 0.1), (second, first, 0.1), (first, points, 0.05)):
+        fields = receptive_fields(sources, targets, radius, 48, rng)
         assert fields.offset.norm(dim=1).max() <= 1 + 1e-6
         assert (fields.weight > 0).all()
-        # A Poisson disk leaves nobody farther than half the field from a sample: no field is empty.
+        # A Poisson disk leaves nobody farther than half the field from a sample.
         assert (fields.target.bincount(minlength=fields.n_targets) > 0).all()
+
+
+def test_what_is_decoded_part_by_part_is_what_is_decoded_at_once(rng: np.random.Generator) -> None:
+    points = torch.tensor(noisy_sphere(rng, 3_000), dtype=torch.float32)
+    model = network().eval()
+    with torch.no_grad():
+        code = model.encode(points, rng)
+        whole = model.decode(code, points, rng)
+        parts = torch.cat([model.decode(code, part, rng) for part in points.split(700)])
+    # No point has more than 48 of the first level's around it, so nothing is drawn by lot.
+    torch.testing.assert_close(parts, whole, rtol=1e-4, atol=1e-7)
 
 
 @pytest.mark.parametrize(("config", "n_parameters"), [(PAPER, 25_000), (RELEASED, 35_840)])

@@ -9,7 +9,16 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
 
-from pcdenoise.cloud.neighbours import NeighbourSearch, coordinate_hash, distinct, knn, radius_pairs, spatial_order
+from pcdenoise.cloud.neighbours import (
+    NeighbourSearch,
+    coordinate_hash,
+    distinct,
+    knn,
+    pairs_within,
+    radius_pairs,
+    spatial_order,
+    thinned,
+)
 
 # A coarse grid makes duplicates and equal distances common; sums of squares of such numbers are exact in float64.
 on_grid = hnp.arrays(np.float64, st.tuples(st.integers(1, 40), st.just(3)), elements=st.integers(-4, 4).map(float))
@@ -116,3 +125,20 @@ def test_distinct_keeps_one_row_of_each_place_and_says_where_the_others_went(poi
     assert len(rows) == len(np.unique(points + 0.0, axis=0)) == len(np.unique(points[rows] + 0.0, axis=0))
     np.testing.assert_array_equal(points[rows][place], points)
     np.testing.assert_array_equal(place[rows], np.arange(len(rows)))
+
+
+@settings(max_examples=40, deadline=None)
+@given(sources=on_grid, targets=on_grid, radius=st.sampled_from([0.5, 1.0, 2.0, 20.0]))
+def test_pairs_between_two_clouds_are_all_pairs_sorted_by_target(sources: np.ndarray, targets: np.ndarray, radius: float) -> None:
+    found = [pair for i, j in pairs_within(sources, targets, radius) for pair in zip(i.tolist(), j.tolist(), strict=True)]
+    first, second = np.nonzero(all_distances(targets, sources) <= radius)
+    assert sorted(found) == list(zip(first.tolist(), second.tolist(), strict=True))
+    assert [i for i, _ in found] == sorted(i for i, _ in found)
+
+
+def test_thinning_leaves_about_the_asked_number_of_neighbours_and_says_which_share(rng: np.random.Generator) -> None:
+    points = rng.random((20_000, 3)) * [1, 1, 0]  # some 630 within 0.1
+    share, kept = thinned(points, points, 0.1, 64, rng)
+    assert share == pytest.approx(64 / 600, rel=0.15)
+    assert len(kept) == pytest.approx(share * 20_000, rel=0.1)  # 2 100 ± 45
+    assert thinned(points, points, 0.01, 64, rng)[0] == 1

@@ -20,17 +20,24 @@ from hypothesis import strategies as st
 from known_clouds import model
 from pcdenoise.errors import ModelError
 from pcdenoise.networks import store
+from pcdenoise.networks.mcconv import MCConvConfig, MCConvNetwork
 from pcdenoise.networks.projection import ProjectionConfig, ProjectionNetwork
 
 ONE_LINE = r"^[^\n]+; [^\n]+$"
 
 
+@pytest.fixture(params=["seeded", "mcconv"])
+def kind(request: pytest.FixtureRequest) -> str:
+    """Which of the networks the folder holds."""
+    return str(request.param)
+
+
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path: Path, kind: str) -> Path:
     """A sound model folder to break."""
     path = tmp_path / "sound"
     store.save(
-        model("seeded").network, path, summary="for tests", training={"seed": 1}, scores={"cd": 2.5}, card="# A card\n\nσ = 1 %\n"
+        model(kind).network, path, summary="for tests", training={"seed": 1}, scores={"cd": 2.5}, card="# A card\n\nσ = 1 %\n"
     )
     return path
 
@@ -65,9 +72,9 @@ def write_tensors(folder: Path, content: dict[str, torch.Tensor]) -> None:
 # What is saved comes back
 
 
-def test_a_saved_model_comes_back_weight_by_weight_and_byte_by_byte(folder: Path, tmp_path: Path) -> None:
+def test_a_saved_model_comes_back_weight_by_weight_and_byte_by_byte(folder: Path, tmp_path: Path, kind: str) -> None:
     loaded = store.load(folder)
-    expected = model("seeded").network.state_dict()
+    expected = model(kind).network.state_dict()
     assert loaded.network.state_dict().keys() == expected.keys()
     for name, tensor in loaded.network.state_dict().items():
         assert torch.equal(tensor, expected[name]), name
@@ -84,9 +91,17 @@ def test_a_saved_model_comes_back_weight_by_weight_and_byte_by_byte(folder: Path
     assert sorted(path.name for path in again.iterdir()) == sorted((store.WEIGHTS, store.CONFIG, store.CARD))
 
 
-@pytest.mark.parametrize("config", [ProjectionConfig(4, 6, (1,), 1), ProjectionConfig(16, 32, (1, 2, 3), 2)])
-def test_networks_of_other_sizes_come_back_in_their_size(tmp_path: Path, config: ProjectionConfig) -> None:
-    network = ProjectionNetwork(config)
+@pytest.mark.parametrize(
+    "config",
+    [
+        ProjectionConfig(4, 6, (1,), 1),
+        ProjectionConfig(16, 32, (1, 2, 3), 2),
+        MCConvConfig(8, None, 0.0, unit=5.0),
+        MCConvConfig(64, 16, 0.2),
+    ],
+)
+def test_networks_of_other_sizes_come_back_in_their_size(tmp_path: Path, config: ProjectionConfig | MCConvConfig) -> None:
+    network = MCConvNetwork(config) if isinstance(config, MCConvConfig) else ProjectionNetwork(config)
     store.save(network, tmp_path, summary="", training={}, scores={}, card="")
     assert store.load(tmp_path).network.config == config
     assert store.info(tmp_path).n_parameters == sum(p.numel() for p in network.parameters())
@@ -233,7 +248,8 @@ def test_weights_of_another_shape_type_or_name_are_refused(folder: Path) -> None
 CONFIG_CHANGES: dict[str, Callable[[dict[str, Any]], object]] = {
     "unknown key": lambda c: c.update(code="import os"),
     "unknown setting": lambda c: c["settings"].update(device="cuda"),
-    "another network": lambda c: c.update(network="mcconv"),
+    "another network": lambda c: c.update(network="projection" if c["network"] == "mcconv" else "mcconv"),
+    "an unknown network": lambda c: c.update(network="transformer"),
     "no network": lambda c: c.pop("network"),
     "no settings": lambda c: c.pop("settings"),
     "settings of another kind": lambda c: c.update(settings=[1, 2]),
@@ -246,7 +262,12 @@ CONFIG_CHANGES: dict[str, Callable[[dict[str, Any]], object]] = {
     "no stage": lambda c: c["settings"].update(rounds=[]),
     "too many stages": lambda c: c["settings"].update(rounds=[1] * 1000),
     "channels of text": lambda c: c["settings"].update(channels="many"),
-    "other channels": lambda c: c["settings"].update(channels=16),
+    "other channels": lambda c: c["settings"].update({"width" if c["network"] == "mcconv" else "channels": 16}),
+    "too wide": lambda c: c["settings"].update(width=10**6),
+    "too many sampled": lambda c: c["settings"].update(sampled=10**9),
+    "nothing kept": lambda c: c["settings"].update(dropout=1.0),
+    "no unit": lambda c: c["settings"].update(unit=0.0),
+    "a unit without end": lambda c: c["settings"].update(unit=float("inf")),
 }
 
 

@@ -26,7 +26,15 @@ class DenoiseConfig(Settings):
     max_move: float | None = Field(None, gt=0, description="Longest move of any point, in the scan's unit.")
     relax_steps: int = Field(4, ge=0, le=100, description="Steps toward even spacing, within the noise; 0 for none.")
     outliers: Literal["keep", "flag", "remove"] = Field("keep", description="What becomes of isolated points.")
-    neighbours: int = Field(24, ge=6, le=1024, description="Neighbours of a classical filter.")
+    unshrink: bool | None = Field(
+        None, description="Take low-frequency moves back, which shrink a cloud pass by pass; by default with mcconv models."
+    )
+    neighbours: int | None = Field(
+        None, ge=1, le=1024, description="Neighbours of the mean filter and of jets; as many as the noise asks for by default."
+    )
+    radius: float | None = Field(None, gt=0, description="Radius of the bilateral filter, in the scan's unit.")
+    sigma_d: float | None = Field(None, gt=0, description="How fast its weights fall with distance, in the scan's unit.")
+    sigma_n: float | None = Field(None, gt=0, description="How fast its weights fall with height, in the scan's unit.")
     seed: int = Field(0, ge=0, description="Seed of every random choice.")
     threads: int | None = Field(None, ge=1, description="Processor threads; all of them by default.")
 
@@ -34,8 +42,21 @@ class DenoiseConfig(Settings):
 class TrainConfig(Settings):
     """How a network learns."""
 
-    method: Literal["supervised"] = Field("supervised", description="Signal; supervised: surfaces that are known exactly.")
-    network: Literal["projection"] = Field("projection", description="Architecture.")
+    method: Literal["supervised", "total"] = Field(
+        "supervised", description="Signal; supervised: surfaces or clouds that are known, total: noisy scans alone."
+    )
+    network: Literal["projection", "mcconv"] = Field("projection", description="Architecture; mcconv is the paper's.")
+    pairs: bool = Field(False, description="Supervised by the noisy and clean clouds of synth folders, not by surfaces.")
+    prior: Literal["full", "space", "none"] = Field("space", description="What makes a neighbour likely: space, and colour.")
+    kernel: str = Field("gaussian", description="The prior's kernel: gaussian, wendland or imq.")
+    alpha: float | None = Field(None, gt=0, description="The kernel's width in radii; the best one in the paper by default.")
+    beta: float = Field(4.0, gt=0, description="Weight of colour in the prior.")
+    blind_spot: bool = Field(True, description="No point is its own target.")
+    regulariser: float = Field(0.1, ge=0, lt=1, description="Share of the term against clustering in the loss.")
+    part_points: int = Field(150_000, ge=1000, description="Most points of a part that scans are cut to.")
+    unit: float | None = Field(None, gt=0, description="The network's unit in the scans' unit; their diagonal by default.")
+    width: int = Field(51, ge=4, le=256, description="Channels of mcconv's first level; 64 is the released size.")
+    sampled: int | None = Field(48, ge=1, le=1024, description="Neighbours that stand for all in mcconv; none for all.")
     channels: int = Field(32, ge=4, le=256, description="Features per point.")
     neighbours: int = Field(32, ge=6, le=256, description="Neighbours that a point looks at.")
     rounds: tuple[int, ...] = Field((2, 2), min_length=1, description="Rounds of messages in each stage.")
@@ -45,6 +66,8 @@ class TrainConfig(Settings):
     )
     steps: int | None = Field(None, ge=1, description="Clouds to learn from; or give a budget.")
     budget_s: float | None = Field(None, gt=0, description="Seconds to learn for; or give steps.")
-    learning_rate: float = Field(3e-3, gt=0, le=1, description="Peak learning rate; it warms up and decays to a hundredth.")
+    learning_rate: float | None = Field(
+        None, gt=0, le=1, description="Peak learning rate; by default 0.003 for projection, 0.005 for mcconv, as in the paper."
+    )
     seed: int = Field(1, ge=0, description="Seed of surfaces, noise and initial weights.")
     threads: int | None = Field(None, ge=1, description="Processor threads; all of them by default.")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -11,6 +13,8 @@ from pcdenoise.cloud.scan import Points
 Indices = NDArray[np.int64]
 Distances = NDArray[np.float64]
 
+PAIRS_AT_ONCE = 2**20
+"""About how many pairs are in memory at a time."""
 _BITS = 21  # per axis: three axes fill 63 bits of one Morton code
 
 
@@ -77,6 +81,43 @@ def radius_pairs(points: Points, radius: float) -> Indices:
     order = spatial_order(points)
     pairs = order[cKDTree(points[order], balanced_tree=False, compact_nodes=False).query_pairs(radius, output_type="ndarray")]
     return np.sort(pairs, axis=1)
+
+
+def thinned(sources: Points, targets: Points, radius: float, n: int, rng: np.random.Generator) -> tuple[float, Indices]:
+    """A share of the sources, and their rows, such that a target has about n within the radius, or all it has."""
+    share = min(1.0, n / _mean_count(sources, targets, radius))
+    return share, np.flatnonzero(rng.random(len(sources)) < share) if share < 1 else np.arange(len(sources))
+
+
+def pairs_within(sources: Points, targets: Points, radius: float) -> Iterator[tuple[Indices, Indices]]:
+    """(target, source) rows of all pairs within the radius, sorted by target; some targets at a time, so memory is bounded."""
+    n_targets = max(1, int(PAIRS_AT_ONCE / _mean_count(sources, targets, radius)))
+    tree = cKDTree(sources)
+    for start in range(0, len(targets), n_targets):
+        block = cKDTree(targets[start : start + n_targets])
+        found = block.sparse_distance_matrix(tree, radius, output_type="ndarray")
+        order = np.argsort(found["i"], kind="stable")
+        yield found["i"][order] + start, found["j"][order]
+
+
+def _mean_count(sources: Points, targets: Points, radius: float) -> float:
+    """About how many sources lie within the radius of a target, at least one."""
+    probes = targets[:: max(1, len(targets) // 256)]
+    counts = cKDTree(sources).query_ball_point(probes, radius, return_length=True)
+    return float(np.maximum(np.mean(counts), 1)) if len(probes) else 1.0
+
+
+def parts(points: Points, most: int) -> Iterator[Indices]:
+    """Rows (M,) of parts of (N, 3) finite points with at most `most` each, halved along the longest side until they fit."""
+    waiting = [np.arange(len(points))]
+    while waiting:
+        rows = waiting.pop()
+        if len(rows) <= most:
+            yield rows
+            continue
+        axis = int(np.ptp(points[rows], axis=0).argmax())
+        order = np.argpartition(points[rows, axis], len(rows) // 2)
+        waiting += [np.sort(rows[order[len(rows) // 2 :]]), np.sort(rows[order[: len(rows) // 2]])]
 
 
 def coordinate_hash(points: Points, seed: int) -> NDArray[np.uint64]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,6 +13,7 @@ from pcdenoise.commands.files import refuse_existing
 from pcdenoise.commands.options import configured, option
 from pcdenoise.errors import UsageError
 
+_prior = partial(option, rich_help_panel="Learning from noisy scans")
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
@@ -23,13 +25,41 @@ def train(
             "--data",
             metavar="SOURCE",
             envvar="PCDENOISE_TRAIN_DATA",
-            help="shapes:N (procedural), a mesh, a folder of meshes or one made by synth; repeat to mix. Default: shapes:400.",
+            help="shapes:N (procedural), a mesh, a folder of meshes or one made by synth; for total, and with --pairs: scans, folders"
+            " of scans, synth folders. Repeat to mix. Default: shapes:400.",
         ),
     ] = ["shapes:400"],  # noqa: B006
-    method: Annotated[Literal["supervised"], option("--method", help="What the model learns from.")] = "supervised",
-    network: Annotated[Literal["projection"], option("--network", help="The network's form.")] = "projection",
-    neighbours: Annotated[int, option("--neighbours", help="How many neighbours a point looks at.")] = 32,
-    learning_rate: Annotated[float, option("--learning-rate", help="The highest; it warms up and decays to a hundredth.")] = 3e-3,
+    method: Annotated[
+        Literal["supervised", "total"],
+        option("--method", help="What the model learns from: surfaces that are known, or (total) noisy scans alone."),
+    ] = "supervised",
+    network: Annotated[
+        Literal["projection", "mcconv"], option("--network", help="The network's form; mcconv is that of Total Denoising.")
+    ] = "projection",
+    pairs: Annotated[
+        bool, option("--pairs", help="supervised: learn from the noisy and clean clouds of synth folders, not from their meshes.")
+    ] = False,
+    neighbours: Annotated[int, option("--neighbours", help="projection: how many neighbours a point looks at.")] = 32,
+    learning_rate: Annotated[
+        float | None,
+        option("--learning-rate", help="The highest, by default 0.003 for projection and 0.005 for mcconv; it decays."),
+    ] = None,
+    prior: Annotated[
+        Literal["full", "space", "none"],
+        _prior("--prior", help="What makes a neighbour a likely target: near in space and colour, in space, or neither."),
+    ] = "space",
+    kernel: Annotated[
+        Literal["gaussian", "wendland", "imq"], _prior("--kernel", help="How chances fall with distance.")
+    ] = "gaussian",
+    alpha: Annotated[
+        float | None, _prior("--alpha", help="Width of the kernel, in radii; by default the best one in the paper.")
+    ] = None,
+    beta: Annotated[float, _prior("--beta", help="Weight of colour against space.")] = 4.0,
+    unit: Annotated[
+        float | None,
+        _prior("--unit", metavar="LENGTH", help="What the network calls 1, in the scans' unit; their diagonal if not given."),
+    ] = None,
+    part_points: Annotated[int, _prior("--part-points", min=1000, help="Cut larger scans to parts of so many points.")] = 150_000,
     steps: Annotated[int | None, option("--steps", min=1, help="Stop after so many steps.")] = None,
     budget: Annotated[str | None, option("--budget", metavar="TIME", help="Stop after so long: 90s, 20m, 1.5h.")] = None,
     init: Annotated[str | None, option("--init", metavar="NAME|DIR", help="Start from this model.")] = None,
@@ -48,7 +78,8 @@ def train(
     from pcdenoise.learning import trainer
 
     settings = configured(
-        TrainConfig, data=data, method=method, network=network, neighbours=neighbours, learning_rate=learning_rate,
+        TrainConfig, data=data, method=method, network=network, pairs=pairs, neighbours=neighbours, learning_rate=learning_rate,
+        prior=prior, kernel=kernel, alpha=alpha, beta=beta, unit=unit, part_points=part_points,
         steps=steps, budget_s=_seconds(budget), seed=seed, threads=threads,
     )  # fmt: skip
     refuse_existing([output / "config.json"], overwrite or resume)

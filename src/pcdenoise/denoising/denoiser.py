@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from threading import Lock
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +21,20 @@ from pcdenoise.cloud.noise_level import NoiseLevel, estimate
 from pcdenoise.cloud.scan import Mask, Points
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import classical, outliers
-from pcdenoise.denoising.relaxation import relax, within
-from pcdenoise.errors import UsageError
+from pcdenoise.denoising.relaxation import relax, within, without_low_frequencies
+from pcdenoise.errors import ModelError, UsageError
 from pcdenoise.networks.store import Model
+
+if TYPE_CHECKING:
+    from pcdenoise.networks.mcconv import MCConvNetwork
+    from pcdenoise.networks.projection import ProjectionNetwork
 
 FEWEST_POINTS = 16
 """Smaller clouds come back as they were: no surface can be told from them."""
 _MOST_PASSES = 10
+_SHRINKING = 0.035
+"""Radius over which moves that all points share are taken back, in the network's units of length; as released."""
+_DECODED_AT_ONCE = 65_536
 _FURTHEST_STDS = 5.0
 """Longest move of one pass along the normal: what is further from the surface is no noise but an outlier or another thing."""
 _WORTHWHILE = 0.75
@@ -115,6 +122,7 @@ class _Cloud:
         self.start: Points = usable[first][order]
         self._row = back[place]
         self.level: NoiseLevel = estimate(self.start, config.seed, self.threads)
+        self.diagonal = float(np.linalg.norm(np.ptp(self.start, axis=0))) if len(self.start) else 0.0
 
     def to_rows(self, values: NDArray[Any], missing: Any) -> NDArray[Any]:
         """Values of the distinct points (D, …) spread to all rows (N, …); positions get their origin back."""
@@ -147,7 +155,7 @@ def _passes(cloud: _Cloud, model: Model | None, config: DenoiseConfig, on_progre
     points, level = cloud.start, cloud.level
     for number in range(1, n_passes + 1):
         task = f"pass {number}" if auto or n_passes > 1 else "cleaning"
-        moved = _one_pass(points, level, model, config, cloud.threads, partial(on_progress, task))
+        moved = _one_pass(points, level, cloud, model, partial(on_progress, task))
         after = estimate(moved, config.seed, cloud.threads)
         length = np.linalg.norm(moved - points, axis=1)
         figures = {
@@ -163,42 +171,76 @@ def _passes(cloud: _Cloud, model: Model | None, config: DenoiseConfig, on_progre
         yield Step(cloud.limited(points), figures)
 
 
-def _one_pass(
-    points: Points, level: NoiseLevel, model: Model | None, config: DenoiseConfig, threads: int, on_share: Callable[[float], None]
-) -> Points:
-    if config.method == "mean":
-        return classical.mean(points, config.neighbours, threads=threads)
-    if config.method == "bilateral":
-        return classical.bilateral(points, threads=threads)
-    if config.method == "jet":
-        return classical.jet(points, config.neighbours, threads=threads)
+def _one_pass(points: Points, level: NoiseLevel, cloud: _Cloud, model: Model | None, on_share: Callable[[float], None]) -> Points:
+    """One pass over (N, 3) points that are the cloud's, or some of them, on their way."""
+    config, threads = cloud.config, cloud.threads
+    if config.method != "network":
+        moved = _filtered(points, config, threads)
+        return _unshrunk(points, moved, cloud.diagonal, config) if config.unshrink else moved
     if model is None:
         raise UsageError("--method network needs a model; give --model, or choose --method jet")
-    moved = _network_pass(points, level, model, config.seed, threads, on_share)
+    from pcdenoise.networks.mcconv import MCConvNetwork
+
+    if isinstance(model.network, MCConvNetwork):
+        unit = model.network.config.unit or cloud.diagonal
+        moved = _mcconv_pass(points, unit, model.network, config.seed, threads, on_share)
+        moved = moved if config.unshrink is False else _unshrunk(points, moved, unit, config)
+    else:
+        moved = _projection_pass(points, level, model.network, config.seed, threads, on_share)
+        moved = _unshrunk(points, moved, cloud.diagonal, config) if config.unshrink else moved
     return relax(within(_FURTHEST_STDS * level.std, points, moved), level.std, config.relax_steps, threads)
 
 
+def _filtered(points: Points, config: DenoiseConfig, threads: int) -> Points:
+    if config.method == "bilateral":
+        return classical.bilateral(points, config.radius, config.sigma_d, config.sigma_n, threads=threads)
+    return classical.FILTERS[config.method](points, config.neighbours, threads=threads)
+
+
+def _unshrunk(points: Points, moved: Points, unit: float, config: DenoiseConfig) -> Points:
+    return points + without_low_frequencies(points, moved - points, _SHRINKING * unit, np.random.default_rng(config.seed))
+
+
 @contextmanager
-def _single_threaded_torch() -> Iterator[None]:
-    """`descend` has threads of its own; torch's would wait for each other."""
+def _torch_threads(number: int) -> Iterator[None]:
     import torch
 
     before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    torch.set_num_threads(number)
     try:
         yield
     finally:
         torch.set_num_threads(before)
 
 
-def _network_pass(
-    points: Points, level: NoiseLevel, model: Model, seed: int, threads: int, on_share: Callable[[float], None]
+def _mcconv_pass(
+    points: Points, unit: float, network: MCConvNetwork, seed: int, threads: int, on_share: Callable[[float], None]
+) -> Points:
+    """In the network's frame. Only the first level, which is small, is looked at as a whole; the points follow in blocks."""
+    import torch
+
+    rng = np.random.default_rng(seed)
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    local = torch.from_numpy((points - centre) / unit)
+    moves = []
+    with _torch_threads(threads), torch.no_grad():
+        code = network.encode(local, rng)
+        for start in range(0, len(points), _DECODED_AT_ONCE):
+            moves.append(network.decode(code, local[start : start + _DECODED_AT_ONCE], rng).double().numpy())
+            on_share(min((start + _DECODED_AT_ONCE) / len(points), 1.0))
+    move = np.concatenate(moves)
+    if not np.isfinite(move).all():
+        raise ModelError("the network gave positions that are not numbers; use another model, or --method jet")
+    return points + unit * move
+
+
+def _projection_pass(
+    points: Points, level: NoiseLevel, network: ProjectionNetwork, seed: int, threads: int, on_share: Callable[[float], None]
 ) -> Points:
     import torch
 
     from pcdenoise.denoising.pyramid import coarsen, descend, share_of_seeds
 
-    network = model.network
     share = share_of_seeds(level, network.config.neighbours)
     done, counting = 0, Lock()
     seeds, count, cell = points, None, np.arange(len(points))
@@ -213,7 +255,8 @@ def _network_pass(
             done += n
             on_share(done / total)
 
-    with _single_threaded_torch(), torch.no_grad():
+    # `descend` has threads of its own; torch's would wait for each other.
+    with _torch_threads(1), torch.no_grad():
         descent = descend(network, seeds, count, points if share < 1 else None, level.std, threads=threads, on_block=on_block)
         moved: Points = (descent.seeds[-1] if descent.landed is None else descent.landed).numpy()
     trust = descent.trust.numpy().astype(np.float64)[cell, None]

@@ -1,4 +1,4 @@
-"""Moves that are no denoising: tangential relaxation toward even spacing, and the limit on any move.
+"""What is done about moves: relaxation toward even spacing, low frequencies taken back, the limit on any move.
 
 Not here: moves along the normal (the network's).
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdenoise.cloud.neighbours import NeighbourSearch
+from pcdenoise.cloud.neighbours import NeighbourSearch, pairs_within, thinned
 from pcdenoise.cloud.scan import Points
 
 _NEIGHBOURS = 12
@@ -20,6 +20,8 @@ _SHEET = (0.25, 0.4)
 """Planarity, (√λ₂ - √λ₁) / √λ₃ of the covariance's ascending eigenvalues, at which points begin to slide and slide in full:
 one in a hundred neighbourhoods of a surface has less than 0.4, half of those in a volume or on a wire less than 0.21."""
 _BLOCK = 65_536
+_LOW_PASS_STD = 0.4 * 2**0.5  # of its radius, as released
+_LOW_PASS_POINTS = 256  # within its radius: more are thinned
 
 
 def relax(points: Points, noise_std: float, steps: int, threads: int = -1) -> Points:
@@ -61,6 +63,24 @@ def within(reach: float, start: Points, moved: Points) -> Points:
     length = np.linalg.norm(slide, axis=1, keepdims=True)
     cut: Points = start + slide * (reach / np.maximum(length, max(reach, 1e-300)))
     return cut
+
+
+def without_low_frequencies(points: Points, moves: Points, radius: float, rng: np.random.Generator) -> Points:
+    """(N, 3) moves of (N, 3) finite points less the Gaussian mean of the moves of all others within the radius.
+
+    "Total Denoising", Iteration: noise moves neighbours against each other, shrinking moves them alike, pass after pass. Where
+    there are very many neighbours, a random sample stands for them. Points without neighbours keep their move.
+    """
+    sums, weights = np.zeros_like(moves), np.zeros(len(moves))
+    _, kept = thinned(points, points, radius, _LOW_PASS_POINTS, rng)
+    for centre, other in pairs_within(points[kept], points, radius):
+        squared = ((points[centre] - points[kept[other]]) ** 2).sum(axis=1)
+        weight = np.where(kept[other] == centre, 0, np.exp(-squared / (2 * (_LOW_PASS_STD * radius) ** 2)))
+        weights += np.bincount(centre, weight, minlength=len(moves))
+        for axis in range(3):
+            sums[:, axis] += np.bincount(centre, weight * moves[kept[other], axis], minlength=len(moves))
+    left: Points = moves - sums / np.maximum(weights, 1e-300)[:, None]
+    return left
 
 
 def _blocks(n: int) -> list[slice]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -11,6 +12,7 @@ from functools import partial
 from itertools import count
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +70,11 @@ class TrainingCloud:
     clutter: Mask
     noise: float
     scale: float
+
+    @property
+    def n_points(self) -> int:
+        """How many points a step on this cloud learns from."""
+        return len(self.seeds) + len(self.judged) if self.on_surface.any() else 0
 
     @property
     def on_surface(self) -> Mask:
@@ -192,7 +199,9 @@ def _surfaces(text: str, seed: int, cache: Path) -> Surfaces:
         raise ScanError(f"{text}: no such file or folder; check --data, or give shapes:400 for procedural surfaces")
     meshes = [file for file in (sorted(path.rglob("*")) if path.is_dir() else [path]) if _is_mesh(file)]
     if not meshes:
-        raise UsageError(f"{text}: no mesh to learn from; give a folder of meshes, shapes:400, or a folder made by pcdenoise synth")
+        raise UsageError(
+            f"{text}: no mesh to learn from; give a folder of meshes, shapes:400, or a folder made by pcdenoise synth"
+        )
     return [partial(_cached, cache / f"{n}.npy", partial(_from_mesh, file)) for n, file in enumerate(meshes)]
 
 
@@ -223,8 +232,30 @@ def _from_mesh(path: Path) -> tuple[Array, Array]:
     return in_unit_sphere(sample.points), sample.normals
 
 
-class CloudSource:
-    """An endless series of training clouds over some lists of surfaces, each list as often as the others.
+CloudT = TypeVar("CloudT")
+
+
+class CloudsAhead(ABC, Generic[CloudT]):
+    """An endless series of training clouds, made ahead of time by one other process."""
+
+    @abstractmethod
+    def cloud(self, number: int, neighbours: int) -> CloudT:
+        """The number-th cloud; it depends on nothing but the source and these."""
+
+    def clouds(self, first: int, neighbours: int, ahead: int = 6) -> Iterator[CloudT]:
+        """Endless clouds from the first-th on."""
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as makers:
+            waiting = deque(makers.submit(self.cloud, first + i, neighbours) for i in range(ahead))
+            try:
+                for number in count(first + ahead):
+                    yield waiting.popleft().result()
+                    waiting.append(makers.submit(self.cloud, number, neighbours))
+            finally:
+                makers.shutdown(cancel_futures=True)
+
+
+class CloudSource(CloudsAhead[TrainingCloud]):
+    """Training clouds over some lists of surfaces, each list as often as the others.
 
     The n-th cloud depends on seed and n alone.
     """
@@ -239,14 +270,3 @@ class CloudSource:
         surface, normals = surfaces[int(rng.integers(len(surfaces)))]()
         turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
         return draw_cloud(surface @ turn, normals @ turn, neighbours, rng)
-
-    def clouds(self, first: int, neighbours: int, ahead: int = 6) -> Iterator[TrainingCloud]:
-        """Endless clouds from the first-th on, made ahead of time by one other process."""
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as makers:
-            waiting = deque(makers.submit(self.cloud, first + i, neighbours) for i in range(ahead))
-            try:
-                for number in count(first + ahead):
-                    yield waiting.popleft().result()
-                    waiting.append(makers.submit(self.cloud, number, neighbours))
-            finally:
-                makers.shutdown(cancel_futures=True)

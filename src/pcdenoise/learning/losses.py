@@ -9,9 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pcdenoise.cloud.neighbours import Indices
+from pcdenoise.cloud.neighbours import Indices, pairs_within
 from pcdenoise.cloud.scan import Points
-from pcdenoise.networks.convolution import pairs_within
 
 
 def annealed_exponent(progress: float, lowest: float = 1e-8) -> float:

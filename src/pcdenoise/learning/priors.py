@@ -20,10 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdenoise.cloud.neighbours import Indices
+from pcdenoise.cloud.neighbours import Indices, pairs_within, thinned
 from pcdenoise.cloud.scan import Points
 from pcdenoise.errors import UsageError
-from pcdenoise.networks.convolution import pairs_within, thinned
 
 Floats = NDArray[np.float64]
 

@@ -13,16 +13,22 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from pcdenoise.config import TrainConfig
 from pcdenoise.errors import ModelError, UsageError, in_one_line
-from pcdenoise.learning.dataset import CloudSource, TrainingCloud, surfaces_from
+from pcdenoise.learning.dataset import CloudsAhead, CloudSource, surfaces_from
+from pcdenoise.learning.scans import ScanSource, parts_from
 from pcdenoise.learning.supervised import supervised_loss
+from pcdenoise.learning.total import total_loss
 from pcdenoise.networks import store
+from pcdenoise.networks.mcconv import MCConvConfig, MCConvNetwork
 from pcdenoise.networks.projection import ProjectionConfig, ProjectionNetwork
 
 CHECKPOINT, LOG = ".checkpoint.safetensors", "training.jsonl"
@@ -54,7 +60,7 @@ def train(
     resume: bool = False,
     on_progress: Callable[[str, float], None] | None = None,
 ) -> TrainingSummary:
-    """Learns from the surfaces in `config.data` and writes the model folder `output`.
+    """Learns from the surfaces or scans in `config.data` and writes the model folder `output`.
 
     The folder also gets training.jsonl, one line per fifty steps. An interrupt (Ctrl-C) saves what was learned and is passed on.
     Raises UsageError when there is nothing to resume or to learn from.
@@ -69,12 +75,12 @@ def train(
     elif (output / CHECKPOINT).exists():
         raise UsageError(f"{output}: holds an unfinished run; give --resume to go on with it, or another folder")
     with tempfile.TemporaryDirectory(prefix="pcdenoise-surfaces-") as cache:
-        source = CloudSource(surfaces_from(config.data, config.seed, Path(cache)), config.seed)
+        source, signal = _lessons(config, Path(cache))
         try:
-            for cloud in source.clouds(run.step, run.network.config.neighbours):
+            for cloud in source.clouds(run.step, _neighbours(run.network)):
                 if run.progress >= 1:
                     break
-                run.learn(supervised_loss, cloud)
+                run.learn(signal, cloud)
                 if on_progress is not None:
                     on_progress(f"step {run.step}, error {run.recent_error:.3f}", run.progress)
         finally:
@@ -83,25 +89,53 @@ def train(
     return run.summary
 
 
-def _initial(config: TrainConfig, init: str | None) -> ProjectionNetwork:
+Signal = Callable[[Any, Any, float, np.random.Generator], tuple[Tensor, Tensor]]
+"""From a network, a cloud, the progress from 0 to 1 and random numbers to the loss and to the error that is reported."""
+
+
+def _lessons(config: TrainConfig, cache: Path) -> tuple[CloudsAhead[Any], Signal]:
+    """What is learned from and how."""
+    if config.method == "supervised" and config.network == "projection" and not config.pairs:
+        surfaces = surfaces_from(config.data, config.seed, cache)
+        return CloudSource(surfaces, config.seed), lambda network, cloud, _progress, _rng: supervised_loss(network, cloud)
+    signal: Signal = lambda network, cloud, progress, rng: total_loss(  # noqa: E731
+        network, cloud, progress, regulariser=config.regulariser, rng=rng
+    )
+    return ScanSource(parts_from(config, cache), config), signal
+
+
+def _neighbours(network: store.Network) -> int:
+    return 0 if isinstance(network, MCConvNetwork) else network.config.neighbours
+
+
+def _initial(config: TrainConfig, init: str | None) -> store.Network:
     """A new network, or one with the weights and sizes of another model; only the number of neighbours is free then."""
     if init is not None:
         learned = store.load(init).network
+        if isinstance(learned, MCConvNetwork) != (config.network == "mcconv"):
+            raise UsageError(f"--init {init}: not a {config.network} model; give --network to match it")
+        if isinstance(learned, MCConvNetwork):
+            if learned.config.unit != config.unit:
+                unit = learned.config.unit or "the diagonal"
+                raise UsageError(f"--init {init}: its unit of length is {unit}; give the same --unit")
+            return copy.deepcopy(learned).train()
         network = ProjectionNetwork(replace(learned.config, neighbours=config.neighbours))
         network.load_state_dict(learned.state_dict())
         return network
-    return ProjectionNetwork(
-        ProjectionConfig(config.channels, config.neighbours, config.rounds, config.landing_rounds)
-    )
+    if config.network == "mcconv":
+        return MCConvNetwork(MCConvConfig(config.width, config.sampled, unit=config.unit))
+    return ProjectionNetwork(ProjectionConfig(config.channels, config.neighbours, config.rounds, config.landing_rounds))
 
 
 class _Run:
     """Weights, their running mean, the optimiser and the record of one training run."""
 
-    def __init__(self, config: TrainConfig, output: Path, network: ProjectionNetwork) -> None:
+    def __init__(self, config: TrainConfig, output: Path, network: store.Network) -> None:
         self.config, self.output, self.network = config, output, network
         self.average = copy.deepcopy(network)
-        self.optimiser = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, betas=(0.9, 0.98), weight_decay=1e-4)
+        self._plan = _PLANS[config.network]
+        self._peak = config.learning_rate or self._plan.learning_rate
+        self.optimiser = self._plan.optimiser(network.parameters(), lr=self._peak)
         self.step, self.points, self._before_s, self._began = 0, 0, 0.0, time.monotonic()
         self._errors: list[float] = []
 
@@ -127,26 +161,29 @@ class _Run:
         """The record so far."""
         return TrainingSummary(self.step, self.points, self.seconds, self.recent_error)
 
-    def learn(self, signal: Callable[[ProjectionNetwork, TrainingCloud], tuple[Tensor, Tensor]], cloud: TrainingCloud) -> None:
+    def learn(self, signal: Signal, cloud: Any) -> None:
         """One step on one cloud; a cloud without judged points or with a loss that is no number teaches nothing."""
         self.step += 1
-        if not cloud.on_surface.any():
+        if not cloud.n_points:
             return
         for group in self.optimiser.param_groups:
-            group["lr"] = self.config.learning_rate * min(1, self.step / _WARM_UP_STEPS) * _cosine(self.progress)
-        loss, error = signal(self.network, cloud)
+            group["lr"] = self._peak * self._plan.rate(self.step, self.progress)
+        rng = np.random.default_rng([self.config.seed, 17, self.step])
+        loss, error = signal(self.network, cloud, min(self.progress, 1.0), rng)
         if not torch.isfinite(loss):
             return
         self.optimiser.zero_grad()
         torch.autograd.backward(loss)
-        nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        nn.utils.clip_grad_norm_(self.network.parameters(), self._plan.clip)
         self.optimiser.step()
-        keep = min(1 - 1 / _AVERAGED_STEPS, self.step / (self.step + 10))
+        keep = min(1 - 1 / _AVERAGED_STEPS, self.step / (self.step + 10)) if self._plan.is_averaged else 0.0
         with torch.no_grad():
             for slow, fast in zip(self.average.parameters(), self.network.parameters(), strict=True):
                 slow.lerp_(fast, 1 - keep)
+            for kept, current in zip(self.average.buffers(), self.network.buffers(), strict=True):
+                kept.copy_(current)
         self._errors = [*self._errors[-99:], float(error.detach())]
-        self.points += len(cloud.seeds) + len(cloud.judged)
+        self.points += cloud.n_points
         if self.step % _LOG_EVERY == 0:
             self._log()
         if self.step % _SAVE_EVERY == 0:
@@ -211,7 +248,7 @@ class _Run:
     def _card(self) -> str:
         rows = "\n".join(f"| {name} | {value} |" for name, value in self.config.model_dump(mode="json").items())
         return (
-            f"# {self.output.resolve().name}\n\nA projection network trained with pcdenoise: {self.summary}.\n\n"
+            f"# {self.output.resolve().name}\n\nA {self.config.network} network trained with pcdenoise: {self.summary}.\n\n"
             f"| setting | value |\n| --- | --- |\n{rows}\n\nThe curve is in {LOG}.\n"
         )
 
@@ -220,5 +257,27 @@ def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
 
-def _cosine(progress: float) -> float:
-    return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1)))
+def _cosine(step: int, progress: float) -> float:
+    return min(1, step / _WARM_UP_STEPS) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1))))
+
+
+def _stairs(_step: int, progress: float) -> float:
+    """As released: times 0.7 after each twenty-fifth of the training, down to a five-hundredth."""
+    return max(0.7 ** math.floor(25 * min(progress, 1)), 0.002)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """How a kind of network is trained. rate: share of the peak learning rate at a step and a progress from 0 to 1."""
+
+    learning_rate: float
+    optimiser: Callable[..., torch.optim.Optimizer]
+    rate: Callable[[int, float], float]
+    clip: float
+    is_averaged: bool
+
+
+_PLANS = {
+    "projection": _Plan(3e-3, partial(torch.optim.AdamW, betas=(0.9, 0.98), weight_decay=1e-4), _cosine, 1.0, True),
+    "mcconv": _Plan(5e-3, torch.optim.Adam, _stairs, math.inf, False),
+}

@@ -19,12 +19,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.special import chndtr
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from pcdenoise.cloud.neighbours import Indices
+from pcdenoise.cloud.neighbours import PAIRS_AT_ONCE, Indices, pairs_within, thinned
 from pcdenoise.cloud.scan import Points
 
 Floats = NDArray[np.float64]
@@ -37,7 +36,6 @@ OUTPUTS_PER_KERNEL = 8
 _PEAK = (2 * np.pi * BANDWIDTH**2) ** -1.5  # what a point adds to the density at its own place
 _REACH = 3 * BANDWIDTH  # beyond which nothing is added
 _DENSITY_POINTS = 64  # expected within the reach: more are thinned, which leaves the estimate unbiased
-_PAIRS_AT_ONCE = 2**20
 _EDGES_AT_ONCE = 2**14
 _EDGES_KEPT = 2**17  # of a layer whose intermediate results stay in memory for the gradient
 
@@ -118,37 +116,13 @@ def _some_edges(sources: Points, targets: Points, radius: float, n: int, rng: np
     return _Edges(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def thinned(sources: Points, targets: Points, radius: float, n: int, rng: np.random.Generator) -> tuple[float, Indices]:
-    """A share of the sources, and their rows, such that a target has about n within the radius, or all it has."""
-    share = min(1.0, n / _mean_count(sources, targets, radius))
-    return share, np.flatnonzero(rng.random(len(sources)) < share) if share < 1 else np.arange(len(sources))
-
-
-def pairs_within(sources: Points, targets: Points, radius: float) -> Iterator[tuple[Indices, Indices]]:
-    """(target, source) rows of all pairs within the radius, sorted by target; some targets at a time, so memory is bounded."""
-    n_targets = max(1, int(_PAIRS_AT_ONCE / _mean_count(sources, targets, radius)))
-    tree = cKDTree(sources)
-    for start in range(0, len(targets), n_targets):
-        block = cKDTree(targets[start : start + n_targets])
-        found = block.sparse_distance_matrix(tree, radius, output_type="ndarray")
-        order = np.argsort(found["i"], kind="stable")
-        yield found["i"][order] + start, found["j"][order]
-
-
-def _mean_count(sources: Points, targets: Points, radius: float) -> float:
-    """About how many sources lie within the radius of a target, at least one."""
-    probes = targets[:: max(1, len(targets) // 256)]
-    counts = cKDTree(sources).query_ball_point(probes, radius, return_length=True)
-    return float(np.maximum(np.mean(counts), 1)) if len(probes) else 1.0
-
-
 def _mass_in_field(target: Indices, offset: Floats) -> Floats:
     """(E,) Σ_k of the kernel around each edge's source over the sources k of the same target, in radii⁻³."""
     first = np.flatnonzero(np.diff(target, prepend=-1))
     count = np.diff(first, append=len(target))
     mass = np.empty(len(target))
     for size in np.unique(count):
-        for rows in np.array_split(first[count == size], max(1, int((count == size).sum() * size**2 / _PAIRS_AT_ONCE))):
+        for rows in np.array_split(first[count == size], max(1, int((count == size).sum() * size**2 / PAIRS_AT_ONCE))):
             edges = rows[:, None] + np.arange(size)
             near = offset[edges]
             norm = (near**2).sum(axis=-1)

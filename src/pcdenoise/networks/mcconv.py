@@ -1,12 +1,13 @@
 """The network of Total Denoising: Monte Carlo convolutions over Poisson-disk levels. Not here: the convolutions (convolution.py).
 
 Hermosilla, Ritschel, Ropinski, "Total Denoising: Unsupervised Learning of 3D Point Cloud Cleaning" (2019), Implementation.
-Lengths are shares of the cloud's bounding-box diagonal, which is 1 in the network's frame.
+Lengths are shares of the unit of the network's frame: the cloud's bounding-box diagonal or, for real scans, some metres.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor, nn
 
 from pcdenoise.cloud.sampling import poisson_disk
 from pcdenoise.cloud.scan import Points
-from pcdenoise.networks.convolution import MonteCarloConvolution, ReceptiveFields, receptive_fields
+from pcdenoise.networks.convolution import MonteCarloConvolution, receptive_fields
 
 FIRST_RADIUS, SECOND_RADIUS = 0.05, 0.10
 """Receptive fields of the first and second level; their Poisson-disk radii are half of that."""
@@ -28,11 +29,13 @@ class MCConvConfig:
     """width: channels of the first level. sampled: neighbours that stand for all, or None for all and the literal density.
 
     Width 51 has the 25 000 parameters that the paper names; 64, as released, has 35 840.
+    unit: what a length of one stands for, in the unit of the scans that were learned from; None for the bounding-box diagonal.
     """
 
     width: int = 51
     sampled: int | None = 48
     dropout: float = 0.2
+    unit: float | None = None
 
 
 PAPER = MCConvConfig()
@@ -55,35 +58,48 @@ class MCConvNetwork(nn.Module):
         self.decode1 = MonteCarloConvolution(width, 3)
 
     def forward(self, points: Tensor, rng: np.random.Generator | None = None) -> Tensor:
-        """(N, 3) displacement of (N, 3) finite points in a frame in which the bounding-box diagonal is 1.
+        """(N, 3) displacement of (N, 3) finite points in a frame in which a unit of length is one.
 
         `rng` draws levels, neighbours and, in training, dropout; None draws the same ones every time. No gradient flows to the
         positions. In training at least two points must stay on the second level.
         """
+        rng = np.random.default_rng(0) if rng is None else rng
+        return self.decode(self.encode(points, rng), points, rng)
+
+    def encode(self, points: Tensor, rng: np.random.Generator) -> Code:
+        """What (N, 3) points look like around each of the first level's points; small, whatever N is."""
+        everything = _positions(points)
+        first = everything[poisson_disk(everything, FIRST_RADIUS / 2, rng)]
+        second = first[poisson_disk(first, SECOND_RADIUS / 2, rng)]
+        sampled, device = self.config.sampled, points.device
+        down1 = receptive_fields(everything, first, FIRST_RADIUS, sampled, rng).to(device)
+        down2 = receptive_fields(first, second, SECOND_RADIUS, sampled, rng).to(device)
+        up2 = receptive_fields(second, first, SECOND_RADIUS, sampled, rng).to(device)
+        if len(first) == 0:
+            return Code(first, torch.zeros(0, self.config.width, device=device))
+        features = self.encode1(torch.ones(len(points), 1, device=device), down1)  # (N1, C)
+        deep = self.encode2(self.mix1(features, rng), down2)  # (N2, 2C)
+        decoded = self.decode2(self.mix2(deep, rng), up2)  # (N1, C)
+        return Code(first, self.mix1_again(torch.cat([decoded, features], dim=1), rng))
+
+    def decode(self, code: Code, points: Tensor, rng: np.random.Generator) -> Tensor:
+        """(M, 3) displacement of some of the points that were encoded."""
         if len(points) == 0:
             return torch.zeros_like(points)
-        rng = np.random.default_rng(0) if rng is None else rng
-        fields = levels(points.detach().cpu().double().numpy(), self.config.sampled, rng)
-        down1, down2, up2, up1 = (each.to(points.device) for each in fields)
-        first = self.encode1(points.new_ones(len(points), 1), down1)  # (N1, C)
-        second = self.encode2(self.mix1(first, rng), down2)  # (N2, 2C)
-        decoded = self.decode2(self.mix2(second, rng), up2)  # (N1, C)
-        move = self.decode1(self.mix1_again(torch.cat([decoded, first], dim=1), rng), up1)  # (N, 3)
-        return LONGEST_MOVE * torch.tanh(move)
+        up1 = receptive_fields(code.points, _positions(points), FIRST_RADIUS, self.config.sampled, rng).to(points.device)
+        return LONGEST_MOVE * torch.tanh(self.decode1(code.features, up1))
 
 
-def levels(
-    points: Points, sampled: int | None, rng: np.random.Generator
-) -> tuple[ReceptiveFields, ReceptiveFields, ReceptiveFields, ReceptiveFields]:
-    """The receptive fields of the two steps down to Poisson-disk subsets of (N, 3) points and of the two steps back up."""
-    first = points[poisson_disk(points, FIRST_RADIUS / 2, rng)]
-    second = first[poisson_disk(first, SECOND_RADIUS / 2, rng)]
-    return (
-        receptive_fields(points, first, FIRST_RADIUS, sampled, rng),
-        receptive_fields(first, second, SECOND_RADIUS, sampled, rng),
-        receptive_fields(second, first, SECOND_RADIUS, sampled, rng),
-        receptive_fields(first, points, FIRST_RADIUS, sampled, rng),
-    )
+class Code(NamedTuple):
+    """The first level: points (N1, 3), features (N1, C)."""
+
+    points: Points
+    features: Tensor
+
+
+def _positions(points: Tensor) -> Points:
+    positions: Points = points.detach().cpu().double().numpy()
+    return positions
 
 
 class Mix(nn.Module):

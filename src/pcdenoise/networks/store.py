@@ -14,14 +14,17 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from pcdenoise.errors import ModelError, in_one_line
 
 if TYPE_CHECKING:
+    from pcdenoise.networks.mcconv import MCConvNetwork
     from pcdenoise.networks.projection import ProjectionNetwork
+
+Network: TypeAlias = "ProjectionNetwork | MCConvNetwork"
 
 WEIGHTS, CONFIG, CARD = "weights.safetensors", "config.json", "README.md"
 DEFAULT = "default"
@@ -33,10 +36,19 @@ class _Settings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+
+class _ProjectionSettings(_Settings):
     channels: int = Field(ge=4, le=256)
     neighbours: int = Field(ge=6, le=256)
     rounds: tuple[Annotated[int, Field(ge=1, le=8)], ...] = Field(min_length=1, max_length=8)
     landing_rounds: int = Field(ge=1, le=8)
+
+
+class _MCConvSettings(_Settings):
+    width: int = Field(ge=4, le=256)
+    sampled: int | None = Field(ge=1, le=1024)
+    dropout: float = Field(ge=0, lt=1)
+    unit: float | None = Field(gt=0, allow_inf_nan=False)
 
 
 class ModelConfig(BaseModel):
@@ -44,11 +56,17 @@ class ModelConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    network: Literal["projection"]
-    settings: _Settings
+    network: Literal["projection", "mcconv"]
+    settings: _ProjectionSettings | _MCConvSettings
     summary: str = ""
     training: dict[str, Any] = Field(default_factory=dict)
     scores: dict[str, Any] = Field(default_factory=dict)
+
+    @field_validator("settings", mode="before")
+    @classmethod
+    def _of_the_network(cls, settings: Any, info: ValidationInfo) -> _Settings:
+        kinds: dict[Any, type[_Settings]] = {"projection": _ProjectionSettings, "mcconv": _MCConvSettings}
+        return kinds[info.data["network"]].model_validate(settings) if "network" in info.data else settings
 
 
 @dataclass(frozen=True)
@@ -56,7 +74,7 @@ class Model:
     """A network ready to run and where it came from. sha256: of the weights file."""
 
     name: str
-    network: ProjectionNetwork
+    network: Network
     config: ModelConfig
     sha256: str
 
@@ -113,19 +131,13 @@ def load(name_or_folder: str | Path = DEFAULT) -> Model:
 
 
 def save(
-    network: ProjectionNetwork, folder: Path, *, summary: str, training: Mapping[str, Any], scores: Mapping[str, Any], card: str
+    network: Network, folder: Path, *, summary: str, training: Mapping[str, Any], scores: Mapping[str, Any], card: str
 ) -> None:
     """Writes a model folder; every file appears whole or not at all."""
     from safetensors.torch import save as serialise
 
     folder.mkdir(parents=True, exist_ok=True)
-    config = ModelConfig(
-        network="projection",
-        settings=_Settings(**asdict(network.config)),
-        summary=summary,
-        training=dict(training),
-        scores=dict(scores),
-    )
+    config = _describe(network).model_copy(update={"summary": summary, "training": dict(training), "scores": dict(scores)})
     files = {
         WEIGHTS: serialise({name: tensor.detach().contiguous() for name, tensor in network.state_dict().items()}),
         CONFIG: (config.model_dump_json(indent=1) + "\n").encode(),
@@ -165,7 +177,18 @@ def _read_config(folder: Path) -> ModelConfig:
         raise ModelError(f"{path}: not a model's config ({in_one_line(fault)}); copy the model folder again") from None
 
 
-def _build(config: ModelConfig) -> ProjectionNetwork:
+def _describe(network: Network) -> ModelConfig:
+    from pcdenoise.networks.mcconv import MCConvNetwork
+
+    kind = "mcconv" if isinstance(network, MCConvNetwork) else "projection"
+    return ModelConfig.model_validate({"network": kind, "settings": asdict(network.config)})
+
+
+def _build(config: ModelConfig) -> Network:
+    from pcdenoise.networks.mcconv import MCConvConfig, MCConvNetwork
     from pcdenoise.networks.projection import ProjectionConfig, ProjectionNetwork
 
-    return ProjectionNetwork(ProjectionConfig(**config.settings.model_dump()))
+    settings = config.settings.model_dump()
+    if config.network == "mcconv":
+        return MCConvNetwork(MCConvConfig(**settings))
+    return ProjectionNetwork(ProjectionConfig(**settings))

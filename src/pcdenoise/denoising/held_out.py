@@ -1,0 +1,60 @@
+"""How good passes are, without ground truth: half of the points are cleaned and judged by the other half.
+
+Not here: the passes themselves and what follows from the judgement (denoiser.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from pcdenoise.cloud.neighbours import NeighbourSearch, coordinate_hash
+from pcdenoise.cloud.noise_level import NoiseLevel
+from pcdenoise.cloud.scan import Points
+
+MOST_POINTS = 60_000
+"""Of a larger cloud, those nearest to one of its points stand for all."""
+_NEIGHBOURS = (16, 256)
+_NEAREST = 4  # of the cleaned points around a held-out one, along the surface
+_FURTHEST_STDS = 4.0
+"""A held-out point further off than that is an outlier, whatever the cleaned half looks like."""
+
+
+class HeldOut:
+    """Two halves of (N, 3) finite, distinct points in a level of noise, the same ones whatever the order of rows.
+
+    Both see the same surface, and the noise of one says nothing about that of the other. So the mean squared height of raw,
+    held-out points over a cleaned one is the noise's variance plus the cleaned one's squared error; the first never changes.
+    That a cleaned point lies beneath is decided along the surface alone: whoever looks for the nearest one in space finds those
+    that err to the same side.
+    """
+
+    def __init__(self, points: Points, level: NoiseLevel, seed: int, threads: int) -> None:
+        number = coordinate_hash(points, seed)
+        if len(points) > MOST_POINTS:
+            distance = np.linalg.norm(points - points[number.argmin()], axis=1)
+            nearest = np.argpartition(distance, MOST_POINTS)[:MOST_POINTS]
+            points, number = points[nearest], number[nearest]
+        seen = number >> np.uint64(63) == 0
+        self.cleaned, self._held = points[seen], points[~seen]
+        self._threads, self._limit = threads, _FURTHEST_STDS * level.std
+        self._k = int(np.clip(level.scale_points / 2, *_NEIGHBOURS))
+        near = points[NeighbourSearch(points, threads).knn(self._held, 2 * self._k)[1]]
+        near -= near.mean(axis=1, keepdims=True)
+        self._normals = np.linalg.eigh(near.transpose(0, 2, 1) @ near)[1][:, :, 0]
+
+    def after(self, one_pass: Callable[[Points], Points]) -> float:
+        """The residual, in the points' unit, once the seen half went through one more pass."""
+        self.cleaned = one_pass(self.cleaned)
+        return self.residual()
+
+    def residual(self) -> float:
+        """Root mean square height of held-out points over the cleaned points that they lie above."""
+        near = self.cleaned[NeighbourSearch(self.cleaned, self._threads).knn(self._held, self._k)[1]]
+        offset = self._held[:, None] - near
+        height = np.einsum("mki,mi->mk", offset, self._normals)
+        along = (offset**2).sum(axis=2) - height**2
+        beneath = np.argpartition(along, min(_NEAREST, along.shape[1] - 1), axis=1)[:, :_NEAREST]
+        height = np.take_along_axis(height, beneath, axis=1)
+        return float(np.sqrt(np.minimum(height**2, self._limit**2).mean()))
