@@ -18,11 +18,13 @@ from pcdenoise import io
 from pcdenoise.cloud.neighbours import knn
 from pcdenoise.cloud.noise_level import estimate
 from pcdenoise.config import DenoiseConfig
-from pcdenoise.denoising import pyramid
+from pcdenoise.denoising import denoiser, pyramid
 from pcdenoise.denoising.denoiser import Result, denoise, iterate
+from pcdenoise.denoising.held_out import HeldOut
 from pcdenoise.denoising.pyramid import share_of_seeds
 from pcdenoise.errors import ModelError, UsageError
 from pcdenoise.networks import store
+from pcdenoise.networks.mcconv import MCConvNetwork
 from pcdenoise.networks.store import Model
 
 PLAIN = DenoiseConfig(threads=1)
@@ -309,6 +311,73 @@ def test_auto_stops_by_itself_and_is_no_worse_than_one_pass(shipped: Model, name
     once = denoise(noisy.noisy, shipped, PLAIN)
     assert 1 <= auto.figures["iterations"] <= 5
     assert noisy.error(auto.points) <= 1.05 * noisy.error(once.points) + 1e-4 * noisy.spacing
+
+
+@pytest.mark.parametrize(
+    ("method", "name", "std_spacings"), [("network", "torus", 1.2), ("jet", "sphere", 0.5), ("bilateral", "sphere", 1.2)]
+)
+def test_auto_comes_within_five_percent_of_whoever_sees_the_truth(
+    shipped: Model, method: str, name: str, std_spacings: float
+) -> None:
+    noisy = cloud(name, 2500, std_spacings)
+    used = shipped if method == "network" else None
+    config = PLAIN.model_copy(update={"method": method, "iters": 10})
+    oracle = min(noisy.error(step.points) for step in denoise(noisy.noisy, used, config).steps)
+    auto = denoise(noisy.noisy, used, config.model_copy(update={"iters": "auto"}))
+    assert noisy.error(auto.points) <= 1.05 * oracle
+    residuals = [step.figures["held_out"] for step in auto.steps]
+    assert residuals == sorted(residuals, reverse=True)
+
+
+def test_the_held_out_residual_is_noise_and_error_together(rng: np.random.Generator) -> None:
+    noise, error = 0.01, 0.006
+    points = np.column_stack([rng.random((20_000, 2)), noise * rng.standard_normal(20_000)])
+    held_out = HeldOut(points, estimate(points, threads=1), 0, 1)
+
+    def denoised(half: np.ndarray) -> np.ndarray:
+        return np.column_stack([half[:, :2], error * rng.standard_normal(len(half))])
+
+    # 10 000 points, each judged by four: known to one percent; cut at four std, the tails miss next to nothing.
+    assert held_out.after(denoised) == pytest.approx(np.hypot(noise, error), rel=0.02)
+    assert held_out.after(lambda half: half * [1, 1, 0]) == pytest.approx(noise, rel=0.02)
+    assert held_out.after(lambda half: half * [1, 1, 0] + [0, 0, 0.005]) == pytest.approx(np.hypot(noise, 0.005), rel=0.02)
+
+
+# The paper's network
+
+
+def test_mcconv_runs_by_the_same_rules(rng: np.random.Generator) -> None:
+    noisy = cloud("sphere", 1500, 1.0).noisy
+    result, again = (clean(noisy, "mcconv") for _ in range(2))
+    np.testing.assert_array_equal(again.points, result.points)
+    assert 0 < result.figures["move_max"] <= 5 * result.figures["noise"] + result.figures["noise"]
+    order = rng.permutation(len(noisy))
+    np.testing.assert_array_equal(clean(noisy[order], "mcconv").points, result.points[order])
+    larger = clean(noisy * 1e3 + UTM, "mcconv").points
+    assert np.median(moves(result.points, (larger - UTM) / 1e3)) < 0.1 * result.figures["move_median"]
+    broken = np.concatenate([noisy, [[np.nan, 0, 0]], noisy[:1]])
+    np.testing.assert_array_equal(clean(broken, "mcconv").points[-1], result.points[0])
+
+
+def test_a_unit_of_length_goes_with_the_model_not_with_the_cloud() -> None:
+    noisy = cloud("sphere", 1500, 1.0).noisy
+    known = model("mcconv")
+    network = MCConvNetwork(replace(known.network.config, unit=float(np.linalg.norm(np.ptp(noisy, axis=0))))).eval()
+    network.load_state_dict(known.network.state_dict())
+    in_metres = replace(known, network=network)
+    np.testing.assert_allclose(denoise(noisy, in_metres, PLAIN).points, clean(noisy, "mcconv").points, atol=1e-9)
+    # A second cloud far away makes the diagonal longer and leaves the unit as it is.
+    two = np.concatenate([noisy, noisy + [100.0, 0, 0]])
+    moved = denoise(two, in_metres, PLAIN).points - two
+    lone = denoise(noisy, in_metres, PLAIN).points - noisy
+    assert np.corrcoef(moved[:1500].ravel(), lone.ravel())[0, 1] > 0.8
+
+
+def test_decoding_in_blocks_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    noisy = cloud("torus", 1500, 0.5).noisy
+    whole = clean(noisy, "mcconv").points
+    monkeypatch.setattr(denoiser, "_DECODED_AT_ONCE", 400)
+    np.testing.assert_allclose(clean(noisy, "mcconv").points, whole, atol=1e-5)
 
 
 def test_progress_grows_to_one_in_every_pass(coarse: Cloud) -> None:

@@ -8,7 +8,7 @@ import pytest
 from known_clouds import UTM, ball, cloud, moves, rms, rotation
 from pcdenoise.cloud.neighbours import knn
 from pcdenoise.denoising import relaxation
-from pcdenoise.denoising.relaxation import relax
+from pcdenoise.denoising.relaxation import relax, without_low_frequencies
 
 STEPS = 8
 
@@ -118,3 +118,22 @@ def test_the_input_is_not_written_to() -> None:
     before = points.copy()
     relax(points, 0.1, STEPS, threads=1)
     np.testing.assert_array_equal(points, before)
+
+
+def test_moves_that_all_share_are_taken_back_and_those_of_single_points_stay(rng: np.random.Generator) -> None:
+    points = np.column_stack([rng.random((4000, 2)), np.zeros(4000)])
+    inner = (np.abs(points[:, :2] - 0.5) < 0.4).all(axis=1)
+    noise, drift = 0.01 * rng.standard_normal((4000, 3)), np.tile([0.02, -0.01, 0.03], (4000, 1))
+    left = without_low_frequencies(points, noise + drift, 0.1, np.random.default_rng(0))[inner]
+    # Some 125 neighbours, of whose weights s = 0.057 leaves about 60 even ones: a mean of their noise of 0.13 remains.
+    assert np.abs(left.mean(axis=0)).max() < 0.001
+    assert (left - noise[inner]).std() < 0.25 * 0.01
+    slope = points[:, :1] * [0, 0, 0.1]  # a Gaussian mean keeps what is linear: nothing of a tilt is left
+    tilted = without_low_frequencies(points, slope, 0.1, np.random.default_rng(0))[inner]
+    assert np.abs(tilted).mean() < 0.02 * np.abs(slope).mean()
+
+
+def test_a_low_pass_leaves_lonely_points_and_empty_clouds_alone(rng: np.random.Generator) -> None:
+    points, moves = np.arange(15.0).reshape(5, 3), rng.standard_normal((5, 3))
+    np.testing.assert_array_equal(without_low_frequencies(points, moves, 0.1, rng), moves)
+    assert len(without_low_frequencies(points[:0], moves[:0], 0.1, rng)) == 0

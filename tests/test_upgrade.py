@@ -83,7 +83,7 @@ def test_what_passes_for_clean_is_another_noisy_point_within_the_patch(rng: np.r
     clean = pseudo_clean(points, rng=rng)
     diagonal = np.linalg.norm(np.ptp(points, axis=0))
     moved = np.linalg.norm(clean - points, axis=1)
-    assert moved[moved > 0].min() > 0
+    assert (moved > 0).mean() > 0.99  # all but those without a neighbour
     assert moved.max() <= 0.05 * diagonal
     assert np.isin(clean.view("V24"), points.view("V24")).all()
     narrow = pseudo_clean(points, prior=Prior(0.02 * diagonal), rng=rng)

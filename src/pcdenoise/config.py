@@ -32,9 +32,9 @@ class DenoiseConfig(Settings):
     neighbours: int | None = Field(
         None, ge=1, le=1024, description="Neighbours of the mean filter and of jets; as many as the noise asks for by default."
     )
-    radius: float | None = Field(None, gt=0, description="Radius of the bilateral filter, in the scan's unit.")
-    sigma_d: float | None = Field(None, gt=0, description="How fast its weights fall with distance, in the scan's unit.")
-    sigma_n: float | None = Field(None, gt=0, description="How fast its weights fall with height, in the scan's unit.")
+    radius: float | None = Field(None, gt=0, description="Radius of the bilateral filter, as a share of the diagonal.")
+    sigma_d: float | None = Field(None, gt=0, description="How fast its weights fall with distance, likewise.")
+    sigma_n: float | None = Field(None, gt=0, description="How fast its weights fall with height, likewise.")
     seed: int = Field(0, ge=0, description="Seed of every random choice.")
     threads: int | None = Field(None, ge=1, description="Processor threads; all of them by default.")
 

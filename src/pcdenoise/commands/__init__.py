@@ -14,7 +14,21 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from pcdenoise import __version__
-from pcdenoise.commands import denoise, eval_chamfer, info, iterate, models, options, synth, train, undo, verify
+from pcdenoise.commands import (
+    denoise,
+    eval_chamfer,
+    info,
+    iterate,
+    models,
+    options,
+    pairs,
+    split,
+    synth,
+    train,
+    tune,
+    undo,
+    verify,
+)
 from pcdenoise.errors import PcdenoiseError, ScanError
 
 EXIT_CODES = """\
@@ -33,7 +47,10 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "undo": undo.undo,
     "models": models.models,
     "synth": synth.synth,
+    "split": split.split,
     "train": train.train,
+    "tune": tune.tune,
+    "pairs": pairs.pairs,
     "eval-chamfer": eval_chamfer.eval_chamfer,
 }
 _SETTINGS: dict[str, Any] = {"auto_envvar_prefix": options.ENVIRONMENT_PREFIX, "help_option_names": ["-h", "--help"]}

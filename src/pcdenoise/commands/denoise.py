@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -26,6 +27,15 @@ if TYPE_CHECKING:
 Method = Annotated[
     Literal["network", "mean", "bilateral", "jet"], option("--method", help="The learned model or a classical filter.")
 ]
+_filter = partial(option, rich_help_panel="Classical filters; pcdenoise tune finds values")
+Neighbours = Annotated[int | None, _filter("--neighbours", min=1, help="mean, jet: nearest points; by default by noise.")]
+Radius = Annotated[float | None, _filter("--radius", help="bilateral: share of the bounding box's diagonal.")]
+SigmaD = Annotated[float | None, _filter("--sigma-d", help="bilateral: fall with distance, a share of the diagonal.")]
+SigmaN = Annotated[float | None, _filter("--sigma-n", help="bilateral: fall with height, a share of the diagonal.")]
+Unshrink = Annotated[
+    bool | None,
+    option("--unshrink/--shrink", help="Take moves that whole regions share back; by default with mcconv models only."),
+]
 Iters = Annotated[str, option("--iters", metavar="N|auto", help="Passes; auto stops when the next would not help.")]
 
 
@@ -35,6 +45,11 @@ def denoise(
     model: options.Model = None,
     method: Method = "network",
     iters: Iters = "1",
+    unshrink: Unshrink = None,
+    neighbours: Neighbours = None,
+    radius: Radius = None,
+    sigma_d: SigmaD = None,
+    sigma_n: SigmaN = None,
     strength: Annotated[float, option("--strength", help="Share of the move that is made, 0 to 1.")] = 1.0,
     max_move: Annotated[float | None, option("--max-move", help="Longest move of a point, in the file's unit.")] = None,
     outliers: Annotated[
@@ -68,7 +83,7 @@ def denoise(
 
     settings = configured(
         DenoiseConfig, method=method, iters=iters, strength=strength, max_move=max_move, outliers=outliers,
-        seed=seed, threads=threads,
+        unshrink=unshrink, neighbours=neighbours, radius=radius, sigma_d=sigma_d, sigma_n=sigma_n, seed=seed, threads=threads,
     )  # fmt: skip
     console, sources = Console(quiet, verbose), expand(inputs)
     if dry_run:

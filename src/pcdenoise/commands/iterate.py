@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pcdenoise.commands import options, outputs
 from pcdenoise.commands.console import Console, figure, table
-from pcdenoise.commands.denoise import Iters, Method, chosen_model
+from pcdenoise.commands.denoise import Iters, Method, Neighbours, Radius, SigmaD, SigmaN, Unshrink, chosen_model
 from pcdenoise.commands.files import format_of, refuse_existing
 from pcdenoise.commands.options import argument, configured, option
 
@@ -23,6 +23,11 @@ def iterate(
     model: options.Model = None,
     method: Method = "network",
     iters: Iters = "5",
+    unshrink: Unshrink = None,
+    neighbours: Neighbours = None,
+    radius: Radius = None,
+    sigma_d: SigmaD = None,
+    sigma_n: SigmaN = None,
     clean: Annotated[Path | None, option("--clean", metavar="FILE", help="Also show the error against this clean cloud.")] = None,
     mesh: Annotated[Path | None, option("--mesh", metavar="FILE", help="Also show the error against this surface.")] = None,
     format: options.Format = None,
@@ -43,7 +48,10 @@ def iterate(
     from pcdenoise.denoising import denoiser
     from pcdenoise.synthesis.meshes import load_mesh
 
-    settings = configured(DenoiseConfig, method=method, iters=iters, seed=seed, threads=threads)
+    settings = configured(
+        DenoiseConfig, method=method, iters=iters, unshrink=unshrink, neighbours=neighbours, radius=radius, sigma_d=sigma_d,
+        sigma_n=sigma_n, seed=seed, threads=threads,
+    )  # fmt: skip
     strip, report = output / "passes.png", output / "report.html"
     refuse_existing([strip, report], overwrite)
     scan = io.read(source, format=format_of(source, format))

@@ -37,8 +37,8 @@ _SHRINKING = 0.035
 _DECODED_AT_ONCE = 65_536
 _FURTHEST_STDS = 5.0
 """Longest move of one pass along the normal: what is further from the surface is no noise but an outlier or another thing."""
-_WORTHWHILE = 0.75
-"""`auto` goes on while a pass leaves less than this share of the noise that it found."""
+_WORTHWHILE = 5e-4
+"""`auto` goes on while a pass lowers the residual over held-out points by this share; see docs/decisions/paper.md."""
 
 Progress = Callable[[str, float], None]
 """Called with what is being done and the share of it that is done, 0 to 1."""
@@ -46,10 +46,10 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Step:
-    """The cloud after one pass, and its figures: iteration, move_median, move_max, roughness_before and roughness_after.
+    """The cloud after one pass, and its figures: iteration, move_median, move_max, roughness_before, roughness_after, held_out.
 
-    Roughness is the estimated noise: what neighbours disagree by. After a pass it says how smooth the cloud is, not how far it
-    still is from the truth, which nobody knows.
+    held_out, where it was looked at, is the residual of `held_out.HeldOut`: noise and error together. Roughness is the estimated
+    noise: what neighbours disagree by. After a pass it says how smooth the cloud is, not how far it still is from the truth.
     """
 
     points: Points
@@ -101,7 +101,7 @@ def denoise(points: Points, model: Model | None, config: DenoiseConfig, on_progr
 def iterate(points: Points, model: Model | None, config: DenoiseConfig) -> Iterator[Step]:
     """Pass after pass, each fed with the last one's output: (N, 3) points and figures of every step."""
     cloud = _Cloud(points, config)
-    for step in _passes(cloud, model, config, lambda _task, _share: None):
+    for step in _passes(cloud, model, config, lambda _task, _share: None, is_judged=True):
         yield Step(cloud.placed(step.points), step.figures)
 
 
@@ -145,16 +145,29 @@ class _Cloud:
         return blended if self.config.max_move is None else within(self.config.max_move, self.start, blended)
 
 
-def _passes(cloud: _Cloud, model: Model | None, config: DenoiseConfig, on_progress: Progress) -> Iterator[Step]:
-    """Every pass goes on from where the last one led, not from what strength and limit leave of it."""
+def _passes(
+    cloud: _Cloud, model: Model | None, config: DenoiseConfig, on_progress: Progress, is_judged: bool = False
+) -> Iterator[Step]:
+    """Every pass goes on from where the last one led, not from what strength and limit leave of it.
+
+    `is_judged`: each pass is also made on half of the points and judged by the other half, as `auto` does anyway.
+    """
     no_surface = config.method == "network" and not cloud.level.is_surface
     if len(cloud.start) < FEWEST_POINTS or config.strength == 0 or no_surface:
         return
     auto = config.iters == "auto"
     n_passes = _MOST_PASSES if config.iters == "auto" else config.iters
+    held_out = HeldOut(cloud.start, cloud.level, config.seed, cloud.threads) if auto or is_judged else None
+    least = np.inf
     points, level = cloud.start, cloud.level
     for number in range(1, n_passes + 1):
         task = f"pass {number}" if auto or n_passes > 1 else "cleaning"
+        judgement = {}
+        if held_out is not None:
+            residual = held_out.after(partial(_fresh_pass, cloud=cloud, model=model))
+            if auto and residual > (1 - _WORTHWHILE) * least:
+                return
+            judgement, least = {"held_out": residual}, residual
         moved = _one_pass(points, level, cloud, model, partial(on_progress, task))
         after = estimate(moved, config.seed, cloud.threads)
         length = np.linalg.norm(moved - points, axis=1)
@@ -164,18 +177,22 @@ def _passes(cloud: _Cloud, model: Model | None, config: DenoiseConfig, on_progre
             "roughness_after": after.std,
             "move_median": float(np.median(length)),
             "move_max": float(length.max()),
+            **judgement,
         }
-        if auto and number > 1 and after.std > _WORTHWHILE * level.std:
-            return
         points, level = moved, after
         yield Step(cloud.limited(points), figures)
+
+
+def _fresh_pass(points: Points, cloud: _Cloud, model: Model | None) -> Points:
+    """One pass over points whose noise nobody has measured yet."""
+    return _one_pass(points, estimate(points, cloud.config.seed, cloud.threads), cloud, model, lambda _share: None)
 
 
 def _one_pass(points: Points, level: NoiseLevel, cloud: _Cloud, model: Model | None, on_share: Callable[[float], None]) -> Points:
     """One pass over (N, 3) points that are the cloud's, or some of them, on their way."""
     config, threads = cloud.config, cloud.threads
     if config.method != "network":
-        moved = _filtered(points, config, threads)
+        moved = _filtered(points, cloud.diagonal, config, threads)
         return _unshrunk(points, moved, cloud.diagonal, config) if config.unshrink else moved
     if model is None:
         raise UsageError("--method network needs a model; give --model, or choose --method jet")
@@ -191,9 +208,10 @@ def _one_pass(points: Points, level: NoiseLevel, cloud: _Cloud, model: Model | N
     return relax(within(_FURTHEST_STDS * level.std, points, moved), level.std, config.relax_steps, threads)
 
 
-def _filtered(points: Points, config: DenoiseConfig, threads: int) -> Points:
+def _filtered(points: Points, diagonal: float, config: DenoiseConfig, threads: int) -> Points:
     if config.method == "bilateral":
-        return classical.bilateral(points, config.radius, config.sigma_d, config.sigma_n, threads=threads)
+        shares = (config.radius, config.sigma_d, config.sigma_n)
+        return classical.bilateral(points, *(None if share is None else share * diagonal for share in shares), threads=threads)
     return classical.FILTERS[config.method](points, config.neighbours, threads=threads)
 
 

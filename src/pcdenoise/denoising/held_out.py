@@ -16,18 +16,17 @@ from pcdenoise.cloud.scan import Points
 MOST_POINTS = 60_000
 """Of a larger cloud, those nearest to one of its points stand for all."""
 _NEIGHBOURS = (16, 256)
-_NEAREST = 4  # of the cleaned points around a held-out one, along the surface
+_NEAREST = 4  # of the held-out points around a cleaned one, along the surface
 _FURTHEST_STDS = 4.0
-"""A held-out point further off than that is an outlier, whatever the cleaned half looks like."""
+"""A held-out point further off than that is an outlier, or the cleaned one is lost."""
 
 
 class HeldOut:
-    """Two halves of (N, 3) finite, distinct points in a level of noise, the same ones whatever the order of rows.
+    """Two halves of (N, 3) finite, distinct points under a level of noise, the same ones whatever the order of rows.
 
-    Both see the same surface, and the noise of one says nothing about that of the other. So the mean squared height of raw,
-    held-out points over a cleaned one is the noise's variance plus the cleaned one's squared error; the first never changes.
-    That a cleaned point lies beneath is decided along the surface alone: whoever looks for the nearest one in space finds those
-    that err to the same side.
+    Both see the same surface, and the noise of one says nothing about that of the other. So the mean squared height of a cleaned
+    point over raw, held-out ones is the noise's variance plus its squared error; the first never changes. Which ones it is above
+    is decided along the surface alone: the nearest ones in space err to the same side as the point.
     """
 
     def __init__(self, points: Points, level: NoiseLevel, seed: int, threads: int) -> None:
@@ -38,9 +37,10 @@ class HeldOut:
             points, number = points[nearest], number[nearest]
         seen = number >> np.uint64(63) == 0
         self.cleaned, self._held = points[seen], points[~seen]
-        self._threads, self._limit = threads, _FURTHEST_STDS * level.std
+        self._search = NeighbourSearch(self._held, threads)
         self._k = int(np.clip(level.scale_points / 2, *_NEIGHBOURS))
-        near = points[NeighbourSearch(points, threads).knn(self._held, 2 * self._k)[1]]
+        self._limit = _FURTHEST_STDS * level.std
+        near = points[NeighbourSearch(points, threads).knn(self.cleaned, 2 * self._k)[1]]
         near -= near.mean(axis=1, keepdims=True)
         self._normals = np.linalg.eigh(near.transpose(0, 2, 1) @ near)[1][:, :, 0]
 
@@ -50,9 +50,8 @@ class HeldOut:
         return self.residual()
 
     def residual(self) -> float:
-        """Root mean square height of held-out points over the cleaned points that they lie above."""
-        near = self.cleaned[NeighbourSearch(self.cleaned, self._threads).knn(self._held, self._k)[1]]
-        offset = self._held[:, None] - near
+        """Root mean square height of the cleaned points over held-out ones."""
+        offset = self._held[self._search.knn(self.cleaned, self._k)[1]] - self.cleaned[:, None]
         height = np.einsum("mki,mi->mk", offset, self._normals)
         along = (offset**2).sum(axis=2) - height**2
         beneath = np.argpartition(along, min(_NEAREST, along.shape[1] - 1), axis=1)[:, :_NEAREST]

@@ -78,7 +78,7 @@ def parts_from(config: TrainConfig, cache: Path) -> list[Part]:
         rows = rows[spatial_order(scan.points[rows])]
         if len(rows) < FEWEST_POINTS:
             continue
-        colour = _colours(scan, rows) if config.method == "total" and config.prior == "full" else np.zeros((0, 3))
+        colour = colours_of(scan)[rows] if config.method == "total" and config.prior == "full" else np.zeros((0, 3))
         clean = io.read(clean_path).points if clean_path is not None else np.zeros((0, 3))
         if config.method == "supervised" and not len(clean):
             raise UsageError(f"{scan_path}: supervised learning needs its clean cloud; give folders made by pcdenoise synth")
@@ -136,14 +136,25 @@ def _files(data: list[Path]) -> Iterator[tuple[Path, Path | None]]:
             raise ScanError(f"{path}: no such file or folder; check --data")
 
 
-def _colours(scan: Scan, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(len(rows), 3) from 0 to 1, whether stored as bytes, as bytes in 16 bits, as 16 bits or as shares."""
+def noisy_and_clean(data: list[Path]) -> Iterator[tuple[Points, Points]]:
+    """(N, 3) noisy and (M, 3) clean points of every pair in folders made by `pcdenoise synth`, the noisy ones' diagonal 1."""
+    for noisy_path, clean_path in _files(data):
+        if clean_path is None:
+            continue
+        noisy, clean = (scan.points[scan.finite] for scan in (io.read(noisy_path), io.read(clean_path)))
+        low, high = noisy.min(axis=0), noisy.max(axis=0)
+        unit = float(np.linalg.norm(high - low)) or 1.0
+        yield (noisy - low) / unit, (clean - low) / unit
+
+
+def colours_of(scan: Scan) -> NDArray[np.float64]:
+    """(N, 3) red, green, blue from 0 to 1, stored as bytes, as bytes in 16 bits, as 16 bits or as shares. Raises UsageError."""
     if any(name not in scan.attributes for name in ("red", "green", "blue")):
         raise UsageError(f"{scan.origin}: has no colour, which --prior full needs; use --prior space")
     stored = np.stack([scan.attributes[name] for name in ("red", "green", "blue")], axis=1)
     largest = float(stored.max(initial=0))
     full = 1.0 if stored.dtype.kind == "f" and largest <= 1 else 255.0 if largest <= 255 else 65535.0
-    colours: NDArray[np.float64] = stored[rows].astype(np.float64) / full
+    colours: NDArray[np.float64] = stored.astype(np.float64) / full
     return colours
 
 

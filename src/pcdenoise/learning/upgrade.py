@@ -32,10 +32,13 @@ def pseudo_clean(
     Right for losses that compare row with row (L2, L1, ...). A loss that looks for the nearest clean point would find the noisy
     point itself, since that is another one's sample.
     """
-    if prior is None:
-        diagonal = float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0
-        prior = Prior(PATCH_SHARE * diagonal or 1.0)
-    return prior.targets(points, colours, rng)
+    return (prior or prior_for(points)).targets(points, colours, rng)
+
+
+def prior_for(points: Points, radius: float | None = None) -> Prior:
+    """The default prior for (N, 3) points: Gaussian, with that radius or 5 % of their bounding box's diagonal."""
+    diagonal = float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0
+    return Prior((PATCH_SHARE * diagonal or 1.0) if radius is None else radius)
 
 
 class PseudoCleanPairs(IterableDataset[tuple[Tensor, Tensor]]):

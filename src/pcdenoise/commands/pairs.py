@@ -1,0 +1,76 @@
+"""`pcdenoise pairs`: noisy and pseudo-clean clouds for other programs that learn from pairs. Not here: the prior (learning)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pcdenoise.commands import options
+from pcdenoise.commands.console import Console
+from pcdenoise.commands.files import expand, format_of, refuse_existing
+from pcdenoise.commands.options import option
+from pcdenoise.errors import UsageError
+
+
+def pairs(
+    inputs: options.Inputs,
+    output: Annotated[Path, option("--output", "-o", metavar="DIR", help="The folder for the pairs.")],
+    draws: Annotated[int, option("--draws", min=1, help="Pseudo-clean clouds for each scan.")] = 10,
+    prior: Annotated[
+        Literal["full", "space"], option("--prior", help="What makes a neighbour likely: space and colour, or space alone.")
+    ] = "space",
+    radius: Annotated[
+        float | None, option("--radius", help="How far a sample may be, in the file's unit; 5 % of the diagonal if not given.")
+    ] = None,
+    to: Annotated[
+        Literal["npz", "ply", "xyz"], option("--to", help="npz: arrays noisy and clean in one file; else a file for each cloud.")
+    ] = "npz",
+    format: options.Format = None,
+    overwrite: options.Overwrite = False,
+    config: options.Config = None,
+    seed: options.Seed = 0,
+    quiet: options.Quiet = False,
+) -> None:
+    """Write noisy clouds with samples that may pass for clean ones, row for row, to train any supervised denoiser without truth.
+
+    Use every draw about equally often: what is learned is their mean. The loss must compare row with row.
+
+    Example: pcdenoise pairs scan.ply -o pairs/ --draws 20
+    """
+    from io import BytesIO
+
+    import numpy as np
+
+    from pcdenoise import io
+    from pcdenoise.cloud.scan import Scan
+    from pcdenoise.evaluation.output import write_whole
+    from pcdenoise.learning.scans import colours_of
+    from pcdenoise.learning.upgrade import prior_for, pseudo_clean
+
+    output.mkdir(parents=True, exist_ok=True)
+    console = Console(quiet)
+    for number, source in enumerate(expand(inputs)):
+        scan = io.read(source, format=format_of(source, format))
+        points = scan.points[scan.finite]
+        colours = colours_of(scan)[scan.finite] if prior == "full" else None
+        if len(points) < 2:
+            raise UsageError(f"{source}: has {len(points)} points; a pair needs neighbours")
+        chosen = prior_for(points, radius)
+        names = [output / f"{source.stem}_{draw:04d}" for draw in range(1, draws + 1)]
+        if to == "npz":
+            targets = [name.with_name(f"{name.name}.npz") for name in names]
+        else:
+            targets = [name.with_name(f"{name.name}_clean.{to}") for name in names]
+            targets.append(output / f"{source.stem}_noisy.{to}")
+        refuse_existing(targets, overwrite)
+        for draw in range(draws):
+            clean = pseudo_clean(points, colours, prior=chosen, rng=np.random.default_rng([seed, number, draw]))
+            if to == "npz":
+                memory = BytesIO()
+                np.savez(memory, noisy=points, clean=clean)
+                write_whole(targets[draw], memory.getvalue(), overwrite=overwrite)
+            else:
+                io.write(Scan(clean, format=to), targets[draw], overwrite=overwrite)
+        if to != "npz":
+            io.write(Scan(points, format=to), targets[-1], overwrite=overwrite)
+        console.note(f"{output}: {draws} pairs of {len(points):,} points from {source}")
