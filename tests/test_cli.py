@@ -281,3 +281,49 @@ def test_verify_passes_a_clean_scan_and_fails_a_changed_attribute_and_a_far_move
     assert "1 rows changed" in the_one_line(capsys.readouterr().err)
     bad.write_text("".join(lines[:-1]))
     assert main(["verify", str(sphere), str(bad)]) == 5
+
+
+def test_split_cuts_a_scan_to_parts_that_hold_every_row_once(sphere: Path) -> None:
+    out = sphere.with_name("parts")
+    assert main(["split", str(sphere), "-o", str(out), "--points", "800", "-q"]) == 0
+    rows = [columns(path) for path in sorted(out.iterdir())]
+    assert [len(part) for part in rows] == [750] * 4
+    assert all((np.diff(part[:, 3]) > 0).all() for part in rows)  # in the file's order
+    joined = np.concatenate(rows)
+    np.testing.assert_array_equal(joined[np.argsort(joined[:, 3])], columns(sphere))
+    assert main(["split", str(sphere), "-o", str(out), "--points", "800", "-q"]) == 3
+
+
+def test_pairs_give_a_foreign_trainer_noisy_and_pseudo_clean_rows(sphere: Path) -> None:
+    out, text = sphere.with_name("pairs"), sphere.with_name("text")
+    assert main(["pairs", str(sphere), "-o", str(out), "--draws", "2", "-q"]) == 0
+    first, second = (np.load(out / f"sphere_000{draw}.npz") for draw in (1, 2))
+    np.testing.assert_allclose(first["noisy"], columns(sphere)[:, :3])
+    assert first["clean"].shape == first["noisy"].shape
+    assert 0 < np.linalg.norm(first["clean"] - first["noisy"], axis=1).max() <= 0.05 * np.sqrt(12) * 1.1
+    assert not np.array_equal(first["clean"], second["clean"])
+    assert main(["pairs", str(sphere), "-o", str(text), "--draws", "1", "--to", "xyz", "--radius", "0.1", "-q"]) == 0
+    assert sorted(path.name for path in text.iterdir()) == ["sphere_0001_clean.xyz", "sphere_noisy.xyz"]
+    moved = columns(text / "sphere_0001_clean.xyz")[:, :3] - columns(text / "sphere_noisy.xyz")[:, :3]
+    assert 0 < np.linalg.norm(moved, axis=1).max() < 0.1001
+    assert main(["pairs", str(sphere), "-o", str(out), "--prior", "full", "--overwrite", "-q"]) == 2
+
+
+def test_what_tune_writes_denoise_reads(tmp_path: Path, rng: np.random.Generator) -> None:
+    from pcdenoise import io
+    from pcdenoise.cloud.scan import Scan
+
+    directions = rng.normal(size=(600, 3))
+    clean = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    io.write(Scan(clean, format="ply"), tmp_path / "clean.ply")
+    io.write(Scan(clean + 0.05 * rng.normal(size=(600, 3)), format="ply"), tmp_path / "noisy.ply")
+    (tmp_path / "dataset.json").write_text(json.dumps({"items": [{"clean": "clean.ply", "noisy": [{"file": "noisy.ply"}]}]}))
+    for method, option in (("mean", "neighbours"), ("bilateral", "sigma_n")):
+        tuned = tmp_path / f"{method}.toml"
+        assert main(["tune", str(tmp_path), "--method", method, "-o", str(tuned), "-q"]) == 0
+        assert f'method = "{method}"' in tuned.read_text()
+        assert option in tuned.read_text() or tuned.read_text().count("=") == 1
+        scan = str(tmp_path / "noisy.ply")
+        assert main(["denoise", scan, "-o", str(tmp_path / f"{method}.ply"), "--config", str(tuned), "-q"]) == 0
+        assert not np.array_equal(io.read(tmp_path / f"{method}.ply").points, io.read(scan).points)
+    assert main(["tune", str(tmp_path / "clean.ply"), "--method", "mean", "-q"]) == 2

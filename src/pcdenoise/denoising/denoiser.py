@@ -37,7 +37,7 @@ _SHRINKING = 0.035
 _DECODED_AT_ONCE = 65_536
 _FURTHEST_STDS = 5.0
 """Longest move of one pass along the normal: what is further from the surface is no noise but an outlier or another thing."""
-_WORTHWHILE = 5e-4
+_WORTHWHILE = 2e-4
 """`auto` goes on while a pass lowers the residual over held-out points by this share; see docs/decisions/paper.md."""
 
 Progress = Callable[[str, float], None]
