@@ -50,9 +50,9 @@ def pairs(tmp_path: Path, rng: np.random.Generator) -> Path:
     return folder
 
 
-def config(**options: object) -> TrainConfig:
+def config(data: Path | str = "shapes:400", **options: object) -> TrainConfig:
     small = {"method": "total", "channels": 4, "rounds": (1,), "landing_rounds": 1, "width": 8, "threads": 1, "steps": 3}
-    return TrainConfig.model_validate(small | options)
+    return TrainConfig.model_validate(small | {"data": (str(data),)} | options)
 
 
 @pytest.mark.parametrize("network", ["projection", "mcconv"])
@@ -60,8 +60,9 @@ def config(**options: object) -> TrainConfig:
 def test_both_networks_learn_from_noisy_clouds_and_from_pairs(
     scans: Path, pairs: Path, tmp_path: Path, network: str, method: str
 ) -> None:
-    chosen = config(network=network, method=method, pairs=method == "supervised")
-    summary = trainer.train([scans if method == "total" else pairs], chosen, tmp_path / "model")
+    data = scans if method == "total" else pairs
+    chosen = config(data=data, network=network, method=method, pairs=method == "supervised")
+    summary = trainer.train(chosen, tmp_path / "model")
     assert summary.steps == 3
     assert np.isfinite(summary.error)
     model = store.load(tmp_path / "model")
@@ -75,11 +76,11 @@ def test_an_interrupted_mcconv_run_resumes_to_the_same_weights(scans: Path, tmp_
         if share >= 0.5:
             raise KeyboardInterrupt
 
-    chosen = config(network="mcconv", steps=4)
-    trainer.train([scans], chosen, tmp_path / "whole")
+    chosen = config(data=scans, network="mcconv", steps=4)
+    trainer.train(chosen, tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
-        trainer.train([scans], chosen, tmp_path / "halves", on_progress=interrupt)
-    trainer.train([scans], chosen, tmp_path / "halves", resume=True)
+        trainer.train(chosen, tmp_path / "halves", on_progress=interrupt)
+    trainer.train(chosen, tmp_path / "halves", resume=True)
     weights = [(tmp_path / name / store.WEIGHTS).read_bytes() for name in ("whole", "halves")]
     assert weights[0] == weights[1]
 
@@ -87,8 +88,8 @@ def test_an_interrupted_mcconv_run_resumes_to_the_same_weights(scans: Path, tmp_
 def test_a_network_trained_on_the_prior_of_one_noisy_sphere_denoises_another(rng: np.random.Generator, tmp_path: Path) -> None:
     for number in range(3):
         io.write(Scan(sphere(rng, 1500), format="ply"), tmp_path / f"{number}.ply")
-    chosen = config(network="mcconv", width=24, steps=80)
-    trainer.train([tmp_path], chosen, tmp_path / "model")
+    chosen = config(data=tmp_path, network="mcconv", width=24, steps=80)
+    trainer.train(chosen, tmp_path / "model")
     fresh = sphere(rng, 1500)
     moved = denoise(fresh, store.load(tmp_path / "model"), DenoiseConfig(threads=1, relax_steps=0, unshrink=False)).points
     before, after = (np.sqrt(np.mean((np.linalg.norm(x, axis=1) - 0.29) ** 2)) for x in (fresh, moved))
@@ -98,8 +99,8 @@ def test_a_network_trained_on_the_prior_of_one_noisy_sphere_denoises_another(rng
 
 def test_targets_are_of_the_part_and_the_loss_is_zero_where_they_are_met(scans: Path, tmp_path: Path) -> None:
     (tmp_path / "cache").mkdir()
-    chosen = config()
-    source = ScanSource(parts_from([scans], chosen, tmp_path / "cache"), chosen)
+    chosen = config(data=scans)
+    source = ScanSource(parts_from(chosen, tmp_path / "cache"), chosen)
     cloud, again, other = source.cloud(0, 0), source.cloud(0, 0), source.cloud(2, 0)
     assert cloud.targets is not None
     np.testing.assert_array_equal(again.targets, cloud.targets)
@@ -125,8 +126,8 @@ def test_large_scans_are_cut_to_compact_parts_that_share_the_unit(rng: np.random
     cache = tmp_path / "cache"
     cache.mkdir()
     with pytest.raises(UsageError, match=r"street\.ply: .*--unit"):
-        parts_from([tmp_path / "street.ply"], config(part_points=2000), cache)
-    found = parts_from([tmp_path / "street.ply"], config(part_points=2000, unit=5.0), cache)
+        parts_from(config(data=tmp_path / "street.ply", part_points=2000), cache)
+    found = parts_from(config(data=tmp_path / "street.ply", part_points=2000, unit=5.0), cache)
     clouds = [part.load()[0] for part in found]
     assert sum(map(len, clouds)) == 5000
     assert len(clouds) == 4
@@ -162,14 +163,25 @@ def test_what_is_missing_is_named(scans: Path, tmp_path: Path) -> None:
         (empty, {}, "no scan"),
     ):
         with pytest.raises(UsageError, match=words):
-            trainer.train([data], config(**options), tmp_path / "model")
-    with pytest.raises(UsageError, match="--data is missing"):
-        trainer.train(None, config(), tmp_path / "model")
+            trainer.train(config(data=data, **options), tmp_path / "model")
+    with pytest.raises(UsageError, match="no scan"):
+        trainer.train(config(), tmp_path / "model")
     (empty / "dataset.json").write_text('{"items": 3}')
     with pytest.raises(PcdenoiseError, match=r"dataset\.json: not a data set's index"):
-        trainer.train([empty], config(), tmp_path / "model")
-    trainer.train([scans], config(network="mcconv", steps=1), tmp_path / "metric")
+        trainer.train(
+            config(
+                data=empty,
+            ),
+            tmp_path / "model",
+        )
+    trainer.train(config(data=scans, network="mcconv", steps=1), tmp_path / "metric")
     with pytest.raises(UsageError, match="--unit"):
-        trainer.train([scans], config(network="mcconv", unit=5.0), tmp_path / "other", init=str(tmp_path / "metric"))
+        trainer.train(config(data=scans, network="mcconv", unit=5.0), tmp_path / "other", init=str(tmp_path / "metric"))
     with pytest.raises(UsageError, match="--network"):
-        trainer.train([scans], config(), tmp_path / "another", init=str(tmp_path / "metric"))
+        trainer.train(
+            config(
+                data=scans,
+            ),
+            tmp_path / "another",
+            init=str(tmp_path / "metric"),
+        )

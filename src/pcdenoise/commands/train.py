@@ -25,8 +25,8 @@ def train(
             "--data",
             metavar="SOURCE",
             envvar="PCDENOISE_TRAIN_DATA",
-            help="shapes:N (procedural), a mesh, a folder of meshes or one made by synth; for total, and with --pairs: scans, folders"
-            " of scans, synth folders. Repeat to mix. Default: shapes:400.",
+            help="shapes:N (procedural), a mesh, a folder of meshes or one made by synth; for total and --pairs: scans,"
+            " folders of scans, synth folders. Repeat to mix. Default: shapes:400.",
         ),
     ] = ["shapes:400"],  # noqa: B006
     method: Annotated[

@@ -21,6 +21,7 @@ from pcdenoise.cloud.noise_level import NoiseLevel, estimate
 from pcdenoise.cloud.scan import Mask, Points
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import classical, outliers
+from pcdenoise.denoising.held_out import HeldOut
 from pcdenoise.denoising.relaxation import relax, within, without_low_frequencies
 from pcdenoise.errors import ModelError, UsageError
 from pcdenoise.networks.store import Model

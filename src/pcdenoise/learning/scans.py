@@ -65,7 +65,7 @@ class ScanCloud:
 
 
 def parts_from(config: TrainConfig, cache: Path) -> list[Part]:
-    """Cuts all scans in `config.data` (files, folders of scans, folders made by `pcdenoise synth`) to parts and keeps them in `cache`.
+    """Cuts all scans in `config.data` (files, folders of scans, folders made by synth) to parts and keeps them in `cache`.
 
     Raises UsageError when there is none, when colours or clean clouds are asked for that are not there, and when a scan must be
     cut but the unit of length is its own diagonal.
@@ -105,9 +105,8 @@ def parts_from(config: TrainConfig, cache: Path) -> list[Part]:
             )
             found.append(Part(path))
     if not found:
-        raise UsageError(
-            f"{', '.join(config.data)}: no scan with {FEWEST_POINTS} points or more; give scans, folders of scans, or synth folders"
-        )
+        names = ", ".join(config.data)
+        raise UsageError(f"{names}: no scan with {FEWEST_POINTS} points or more; give scans, folders of scans, or synth folders")
     return found
 
 
