@@ -9,6 +9,7 @@ from torch import Tensor
 
 from known_clouds import ball, cloud, model, rotation
 from pcdenoise.cloud.neighbours import knn
+from pcdenoise.networks.exchange import exchange
 from pcdenoise.networks.projection import (
     Edges,
     Planes,
@@ -52,6 +53,38 @@ def stage_of(kind: str) -> Stage:
     stage = model(kind).network.stages[0]
     assert isinstance(stage, Stage)
     return stage
+
+
+# Messages
+
+
+def test_messages_and_their_derivative_are_those_of_plain_layers():
+    """More points than one part holds; float64, so that only the order of sums differs."""
+    generator = torch.Generator().manual_seed(1)
+
+    def drawn(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64).requires_grad_()
+
+    m, n, k, c = 300, 50, 5, 6
+    edge, own, heard, w1, b1, w2, b2 = drawn(m, k, 8), drawn(m, c), drawn(n, c), drawn(c, 8), drawn(c), drawn(c, c), drawn(c)
+    inputs = (edge, own, heard, w1, b1, w2, b2)
+    source = torch.randint(n, (m, k), generator=generator)
+    weight = torch.rand(m, k, generator=generator, dtype=torch.float64)
+    pulls = [drawn(m, k, c).detach(), drawn(m, c).detach(), drawn(m, c).detach()]
+
+    hidden = (edge @ w1.T + b1 + own[:, None] + heard[source]).relu()
+    message = (hidden @ w2.T + b2).relu()
+    most = (message * (weight / weight.amax(1, keepdim=True))[:, :, None]).amax(1)
+    plain = (message, (weight[:, :, None] * message).sum(1), most)
+    for one, other in zip(exchange(edge, own, heard, source, weight, (w1, b1), (w2, b2)), plain, strict=True):
+        torch.testing.assert_close(one, other)
+    for used in ((0, 1, 2), (0,), (1, 2)):
+        gradients = [
+            torch.autograd.grad(sum((pulls[i] * out[i]).sum() for i in used), inputs, retain_graph=True)
+            for out in (exchange(edge, own, heard, source, weight, (w1, b1), (w2, b2)), plain)
+        ]
+        for one, other in zip(*gradients, strict=True):
+            torch.testing.assert_close(one, other)
 
 
 # Eigenvectors

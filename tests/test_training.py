@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,9 +34,9 @@ def test_the_error_of_a_prediction_is_its_distance_to_the_sphere(surface):
 
 
 def test_training_clouds_depend_on_seed_and_number_alone(tmp_path):
-    sources = [CloudSource(surfaces_from(None, 2, 5, tmp_path / name), 5) for name in ("a", "b")]
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
+    sources = [CloudSource(surfaces_from(["shapes:2"], 5, tmp_path / name), 5) for name in ("a", "b")]
     first, again = (source.cloud(3, 24) for source in sources)
     np.testing.assert_array_equal(first.seeds, again.seeds)
     np.testing.assert_array_equal(first.judged, again.judged)
@@ -60,20 +59,20 @@ def test_learning_from_one_cloud_lowers_its_error(surface):
 
 
 def test_an_interrupted_run_resumes_to_the_same_weights_as_an_undisturbed_one(tmp_path):
-    config = TrainConfig(steps=4, channels=4, rounds=(1,), landing_rounds=1, n_surfaces=1, threads=1)
+    config = TrainConfig(steps=4, channels=4, rounds=(1,), landing_rounds=1, data=("shapes:1",), threads=1)
 
     def interrupt(_task: str, share: float) -> None:
         if share >= 0.5:
             raise KeyboardInterrupt
 
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    trainer.train(None, config, whole)
+    trainer.train(config, whole)
     with pytest.raises(KeyboardInterrupt):
-        trainer.train(None, config, parts, on_progress=interrupt)
+        trainer.train(config, parts, on_progress=interrupt)
     assert store.load(parts).config.training["steps_done"] == 2  # what was learned so far is a model already
     with pytest.raises(UsageError, match="--resume"):
-        trainer.train(None, config, parts)
-    summary = trainer.train(None, config, parts, resume=True)
+        trainer.train(config, parts)
+    summary = trainer.train(config, parts, resume=True)
     assert summary.steps == 4
     assert (whole / store.WEIGHTS).read_bytes() == (parts / store.WEIGHTS).read_bytes()
     assert not (parts / trainer.CHECKPOINT).exists()
@@ -81,7 +80,7 @@ def test_an_interrupted_run_resumes_to_the_same_weights_as_an_undisturbed_one(tm
 
 
 def test_there_must_be_something_to_resume_and_it_must_be_a_checkpoint(tmp_path):
-    resume = partial(trainer.train, None, TrainConfig(steps=1, channels=4, rounds=(1,), n_surfaces=1), resume=True)
+    resume = partial(trainer.train, TrainConfig(steps=1, channels=4, rounds=(1,), data=("shapes:1",)), resume=True)
     with pytest.raises(UsageError, match="nothing to resume"):
         resume(tmp_path)
     (tmp_path / trainer.CHECKPOINT).write_bytes(b"\x08" + bytes(30))
@@ -91,8 +90,11 @@ def test_there_must_be_something_to_resume_and_it_must_be_a_checkpoint(tmp_path)
 
 def test_meshes_are_found_in_folders_and_point_clouds_are_not_taken_for_them(tmp_path):
     (tmp_path / "cloud.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n")
+    (tmp_path / "first").mkdir()
+    (tmp_path / "second").mkdir()
     with pytest.raises(UsageError, match="no mesh"):
-        surfaces_from([tmp_path], 0, 0, tmp_path)
+        surfaces_from([str(tmp_path)], 0, tmp_path / "first")
     (tmp_path / "deep").mkdir()
     (tmp_path / "deep" / "shape.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
-    assert len(surfaces_from([Path(tmp_path)], 0, 0, tmp_path)) == 1
+    both = surfaces_from([str(tmp_path), "shapes:3"], 0, tmp_path / "second")
+    assert [len(surfaces) for surfaces in both] == [1, 3]
