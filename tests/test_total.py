@@ -115,7 +115,7 @@ def test_targets_are_of_the_part_and_the_loss_is_zero_where_they_are_met(scans: 
     still = type(cloud)(cloud.points, cloud.rows, met, None, cloud.noise, None)
     for progress in (0.0, 0.5):
         loss, error = total_loss(network, still, progress, regulariser=0.0, rng=np.random.default_rng(3))
-        assert float(loss) <= 1e-4  # ε to the power of one
+        assert float(loss.detach()) <= 1e-4  # ε to the power of one
         assert float(error) == 0
         assert float(total_loss(network, cloud, progress, regulariser=0.0, rng=np.random.default_rng(3))[0]) > 1e-4
 

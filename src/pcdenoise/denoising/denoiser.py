@@ -40,6 +40,8 @@ _FURTHEST_STDS = 5.0
 """Longest move of one pass along the normal: what is further from the surface is no noise but an outlier or another thing."""
 _WORTHWHILE = 2e-4
 """`auto` goes on while a pass lowers the residual over held-out points by this share; see docs/decisions/paper.md."""
+_NOTHING = 1e-6
+"""Of the spacing: a residual that falls by less is that of a cloud without noise."""
 
 Progress = Callable[[str, float], None]
 """Called with what is being done and the share of it that is done, 0 to 1."""
@@ -166,7 +168,7 @@ def _passes(
         judgement = {}
         if held_out is not None:
             residual = held_out.after(partial(_fresh_pass, cloud=cloud, model=model))
-            if auto and residual > (1 - _WORTHWHILE) * least:
+            if auto and residual > (1 - _WORTHWHILE) * least - _NOTHING * cloud.level.spacing:
                 return
             judgement, least = {"held_out": residual}, residual
         moved = _one_pass(points, level, cloud, model, partial(on_progress, task))
