@@ -14,6 +14,7 @@ from pcdenoise.commands.console import Console, figure, table
 from pcdenoise.commands.files import Job, expand, format_of, plan, refuse_existing
 from pcdenoise.commands.options import configured, option
 from pcdenoise.commands.undo import with_displacement
+from pcdenoise.commands.verify import MaxDrift, check_drift
 from pcdenoise.errors import UsageError
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ def denoise(
     sigma_n: SigmaN = None,
     strength: Annotated[float, option("--strength", help="Share of the move that is made, 0 to 1.")] = 1.0,
     max_move: Annotated[float | None, option("--max-move", help="Longest move of a point, in the file's unit.")] = None,
+    max_drift: MaxDrift = None,
     outliers: Annotated[
         Literal["keep", "flag", "remove"], option("--outliers", help="Points far from any surface: keep, mark, or leave out.")
     ] = "keep",
@@ -95,7 +97,7 @@ def denoise(
     pictures = {job.source: job.target for job in plan(sources, str(picture), format="png")} if picture else {}
     refuse_existing([*(job.target for job in jobs), *pictures.values(), report], overwrite)
     cleaning = _Cleaning(
-        settings, chosen_model(model, settings), console, format, overwrite, drop_attributes, displacement, pictures
+        settings, chosen_model(model, settings), console, format, overwrite, drop_attributes, displacement, max_drift, pictures
     )
     batch = Batch(console)
     batch.run(jobs, cleaning.clean)
@@ -127,6 +129,7 @@ class _Cleaning:
     overwrite: bool
     drop_attributes: bool
     displacement: bool
+    max_drift: float | None
     pictures: dict[Path, Path]
     pages: list[Page] = field(default_factory=list)
 
@@ -150,6 +153,7 @@ class _Cleaning:
             result = denoiser.denoise(scan.points, self.model, self.config, on_progress)
         for step in result.steps:
             self.console.detail(", ".join(f"{name.replace('_', ' ')} {figure(value)}" for name, value in step.figures.items()))
+        check_drift(job.target, result.figures["drift"], result.figures["noise"], self.max_drift)
         job.target.parent.mkdir(parents=True, exist_ok=True)
         io.write(
             self._marked(scan, result), job.target, format=format_of(job.target, self.format), overwrite=self.overwrite,

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pcdenoise.cloud import drift
 from pcdenoise.cloud.neighbours import distinct, spatial_order
 from pcdenoise.cloud.noise_level import NoiseLevel, estimate
 from pcdenoise.cloud.scan import Mask, Points
@@ -82,6 +83,7 @@ def denoise(points: Points, model: Model | None, config: DenoiseConfig, on_progr
     moved = steps[-1].points if steps else cloud.start
     unmoved = cloud.unmoved(moved)
     length = np.linalg.norm(moved - cloud.start, axis=1) if len(moved) else np.zeros(1)
+    drifted = drift.measure(cloud.start, moved, config.seed, cloud.threads)
     figures = {
         "noise": cloud.level.std,
         "spacing": cloud.level.spacing,
@@ -90,6 +92,8 @@ def denoise(points: Points, model: Model | None, config: DenoiseConfig, on_progr
         "move_median": float(np.median(length)),
         "move_p99": float(np.quantile(length, 0.99)),
         "move_max": float(length.max()),
+        "drift": drifted.size,
+        "drift_inward": drifted.inward,
         "points_left_alone": int(unmoved.sum()),
         "points_not_finite": int((~cloud.finite).sum()),
         "points_coincident": int(cloud.finite.sum()) - len(cloud.start),

@@ -6,7 +6,7 @@ What was read is written back as it was but for the coordinates that moved: `Sca
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -108,6 +108,25 @@ def select(scan: Scan, keep: Mask) -> Scan:
     source = scan.source.selected(keep)
     new = {name: values[keep] for name, values in changed(scan).items()}
     return replace(scan, points=scan.points[keep], attributes={**source.columns, **new}, source=source)
+
+
+def without(scan: Scan, names: Collection[str]) -> Scan:
+    """The scan without these columns, and its file without them and without our provenance: as before they were added.
+
+    LAS gets back the software, bounds and earlier provenance that writing ours replaced. A text file loses the columns' names
+    too. Raises ScanError if there is no such column.
+    """
+    for name in names:
+        if name not in scan.attributes:
+            raise ScanError(f"{scan.origin}: there is no column {name} to take away; it has {', '.join(scan.attributes)}")
+    left = {name: values for name, values in scan.attributes.items() if name not in names}
+    added = tuple(name for name in scan.added if name not in names)
+    if scan.source is None:
+        return replace(scan, attributes=left, added=added)
+    source = scan.source.without([name for name in names if name in scan.source.columns])
+    new = changed(scan)
+    columns = {name: left[name] if name in new else source.columns.get(name, left[name]) for name in left}
+    return replace(scan, attributes=columns, added=added, source=source)
 
 
 def _encode(scan: Scan, file: BinaryIO, format: str, suffix: str, provenance: Mapping[str, Any] | None) -> None:
