@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from io_samples import LAS_FLAVOURS, XYZ, evlr, extra_bytes_entry, las, pcd, ply, vlr
-from known_clouds import cloud
 
 import pcdenoise
+from io_samples import LAS_FLAVOURS, XYZ, evlr, extra_bytes_entry, las, pcd, ply, vlr
+from known_clouds import cloud
 from pcdenoise.cloud.scan import Scan
 from pcdenoise.commands import main
 from pcdenoise.commands.undo import restored, with_displacement

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from known_clouds import UTM, cloud, rotation
 
+from known_clouds import UTM, cloud, rotation
 from pcdenoise.cloud import drift
 from pcdenoise.denoising import classical
 

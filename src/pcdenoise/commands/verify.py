@@ -59,7 +59,9 @@ def check_drift(path: Path, drift: float, noise: float, limit: float | None) -> 
         said = (
             f"the surface drifted by {figure(drift)}, {figure(drift / noise)} of the noise" if noise > 0 else "a clean scan moved"
         )
-        raise GateError(f"{path}: {said}; the limit is {figure(limit)}; use fewer passes, less --strength or another --method")
+        raise GateError(
+            f"{path}: the surface drifted by {figure(drift)}{share}; the limit is {figure(limit)}; use fewer passes, less --strength or another --method"
+        )
 
 
 def compare(before: Scan, after: Scan) -> dict[str, Any]:
