@@ -142,7 +142,7 @@ class _Cleaning:
     def clean(self, job: Job) -> Figures:
         """Reads one scan, cleans it, writes it with its picture, and returns its figures."""
         from pcdenoise import io
-        from pcdenoise.commands.info import coordinate_step
+        from pcdenoise.commands.survey import traps
         from pcdenoise.denoising import denoiser
         from pcdenoise.evaluation.report import Page
 
@@ -163,11 +163,8 @@ class _Cleaning:
         if picture := self.pictures.get(job.source):
             outputs.save_before_after(picture, scan, result.points, notes=_notes(result), overwrite=self.overwrite)
         self.pages[:] = [Page(scan.points, result.points, colours=outputs.colours(scan))]
-        grid = coordinate_step(scan)
-        if grid and 0 < figures["move_median"] < grid / 2:
-            self.console.note(
-                f"{job.target}: most moves are below the file's step of {grid:g} and vanish; write .ply to keep them"
-            )
+        for text in traps(scan, figures["noise"] if figures["is_surface"] else None):
+            self.console.note(f"{job.source}: {text}")
         self.console.note(f"{job.target}: {_summary(figures)}" + (f"; picture {picture}" if picture else ""))
         return figures
 
@@ -206,10 +203,10 @@ def _summary(figures: Figures) -> str:
 def _plan_text(sources: list[Path], output: str, suffix: str, format: str | None, settings: DenoiseConfig) -> str:
     """What a run would do, input by input, after a look at each."""
     from pcdenoise import io
-    from pcdenoise.commands.info import survey
+    from pcdenoise.commands.survey import cost, cost_text, survey
 
     jobs = plan(sources, output, suffix=suffix, format=format) if output else [Job(source, Path("?")) for source in sources]
-    rows = []
+    rows, warnings = [], []
     for job in jobs:
         found = survey(io.read(job.source, format=format_of(job.source, format)), seed=settings.seed)
         noise = figure(found["noise"]) if found.get("is_surface") else "no surface"
@@ -220,7 +217,9 @@ def _plan_text(sources: list[Path], output: str, suffix: str, format: str | None
                 figure(found.get("spacing", 0.0)),
                 noise,
                 str(settings.iters),
+                cost_text(cost(found["points"], 3 if settings.iters == "auto" else settings.iters)),
                 str(job.target),
             ]
         )
-    return table(["input", "points", "spacing", "noise", "passes", "output"], rows)
+        warnings += [f"warning: {job.source}: {text}" for text in found["warnings"]]
+    return "\n".join([table(["input", "points", "spacing", "noise", "passes", "cost", "output"], rows), *warnings])

@@ -56,12 +56,9 @@ def verify(
 def check_drift(path: Path, drift: float, noise: float, limit: float | None) -> None:
     """Raises GateError if a surface drifted by more than `limit` times the noise that was to be removed."""
     if limit is not None and drift > limit * noise:
-        said = (
-            f"the surface drifted by {figure(drift)}, {figure(drift / noise)} of the noise" if noise > 0 else "a clean scan moved"
-        )
-        raise GateError(
-            f"{path}: the surface drifted by {figure(drift)}{share}; the limit is {figure(limit)}; use fewer passes, less --strength or another --method"
-        )
+        share = f", {figure(drift / noise)} of the noise" if noise > 0 else " without any noise"
+        fix = "use fewer passes, less --strength or another --method"
+        raise GateError(f"{path}: the surface drifted by {figure(drift)}{share}; the limit is {figure(limit)}; {fix}")
 
 
 def compare(before: Scan, after: Scan) -> dict[str, Any]:

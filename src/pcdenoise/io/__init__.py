@@ -12,9 +12,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, BinaryIO
 
+import numpy as np
+
 from pcdenoise.cloud.scan import Mask, Scan
 from pcdenoise.errors import ScanError
 from pcdenoise.io import files, kitti, las, pcd, ply, xyz
+from pcdenoise.io.crs import Crs
 from pcdenoise.io.source import changed, portable
 
 SUFFIXES = {
@@ -108,6 +111,26 @@ def select(scan: Scan, keep: Mask) -> Scan:
     source = scan.source.selected(keep)
     new = {name: values[keep] for name, values in changed(scan).items()}
     return replace(scan, points=scan.points[keep], attributes={**source.columns, **new}, source=source)
+
+
+def coordinate_system(scan: Scan) -> Crs | None:
+    """The coordinate reference system that the scan's file names, None if it names none; only LAS and LAZ do."""
+    return scan.source.crs() if isinstance(scan.source, las.LasSource) else None
+
+
+def coordinate_step(scan: Scan) -> float | None:
+    """The step between coordinates that the file can hold: the scale of a LAS, the decimals of a text; None if there is none.
+
+    Apart from LAS it is told from up to 10 000 rows: the largest power of ten, 1 to 1e-8, that all coordinates are multiples of.
+    """
+    if isinstance(scan.source, las.LasSource):
+        return float(np.abs(scan.source.file.field("scale")).max())
+    some = scan.points[scan.finite][:: max(1, len(scan) // 10_000)]
+    for decimals in range(9) if len(some) else ():
+        scaled = some * 10.0**decimals
+        if (np.abs(scaled - np.rint(scaled)) <= 1e-6 + 8 * np.finfo(np.float64).eps * np.abs(scaled)).all():
+            return float(10.0**-decimals)
+    return None
 
 
 def without(scan: Scan, names: Collection[str]) -> Scan:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from pcdenoise import __version__
 from pcdenoise.cloud.scan import Mask, Points, Scan
 from pcdenoise.errors import ScanError
-from pcdenoise.io import las_file
+from pcdenoise.io import crs, las_file
+from pcdenoise.io.crs import Crs
 from pcdenoise.io.las_dimensions import EXTRA_BYTES, Dimension, extended, reduced, structured
 from pcdenoise.io.las_file import HEADER, LasFile
 from pcdenoise.io.source import Column, changed, colours_as_words, portable, step_decimals, storable
@@ -23,6 +24,7 @@ _CRS_IS_WKT = 16
 _BEFORE = "header_before"
 """Key of the provenance under which a file's software, bounds and earlier provenance are kept, so that they can come back."""
 _LONGEST_NOTE = 1 << 14
+_VLR_HEAD, _EVLR_HEAD = 54, 60
 _INT32 = np.iinfo(np.int32)
 _QUANTA = 1e-8
 
@@ -60,6 +62,16 @@ class LasSource:
         if self.file.field("waveforms_start"):
             found.append("waveform packets")
         return list(dict.fromkeys(found))
+
+    def crs(self) -> Crs | None:
+        """The coordinate reference system that its records name."""
+        records = [*((record, _VLR_HEAD) for record in self.file.vlrs), *((record, _EVLR_HEAD) for record in self.file.evlrs())]
+        said = {
+            las_file.vlr_identity(record)[1]: record[head:]
+            for record, head in reversed(records)
+            if las_file.vlr_identity(record)[0] == b"LASF_Projection"
+        }
+        return crs.parse(said)
 
     def payloads(self) -> dict[str, bytes]:
         """The bytes of each VLR and EVLR that says nothing about the layout of points, and of the waveforms, by name."""
