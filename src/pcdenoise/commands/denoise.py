@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pcdenoise.commands import options, outputs
+from pcdenoise.commands import options, outputs, selection
 from pcdenoise.commands.batch import Batch, Figures
 from pcdenoise.commands.console import Console, figure, table
 from pcdenoise.commands.files import Job, expand, format_of, plan, refuse_existing
@@ -57,6 +57,9 @@ def denoise(
     outliers: Annotated[
         Literal["keep", "flag", "remove"], option("--outliers", help="Points far from any surface: keep, mark, or leave out.")
     ] = "keep",
+    only_class: selection.OnlyClass = "",
+    context: selection.Context = "class",
+    roi: selection.Roi = "",
     displacement: Annotated[
         bool, option("--displacement", help="Store where each point was and how far it moved; undo needs it.")
     ] = False,
@@ -96,9 +99,11 @@ def denoise(
     jobs = plan(sources, output, suffix=suffix, format=format)
     pictures = {job.source: job.target for job in plan(sources, str(picture), format="png")} if picture else {}
     refuse_existing([*(job.target for job in jobs), *pictures.values(), report], overwrite)
+    chosen = selection.Selection.of(only_class, context, roi)
     cleaning = _Cleaning(
-        settings, chosen_model(model, settings), console, format, overwrite, drop_attributes, displacement, max_drift, pictures
-    )
+        settings, chosen, chosen_model(model, settings), console, format, overwrite, drop_attributes, displacement, max_drift,
+        pictures,
+    )  # fmt: skip
     batch = Batch(console)
     batch.run(jobs, cleaning.clean)
     if report:
@@ -123,6 +128,7 @@ class _Cleaning:
     """What is the same for every scan of a run: how to clean, what to write, and pages of the last scan for its report."""
 
     config: DenoiseConfig
+    selection: selection.Selection
     model: Model | None
     console: Console
     format: str | None
@@ -137,20 +143,24 @@ class _Cleaning:
     def settings(self) -> dict[str, Any]:
         """Everything that shaped the result, by name, for the report and the file's provenance."""
         named = {"model": self.model.name, "model_sha256": self.model.sha256} if self.model else {}
-        return {**self.config.model_dump(mode="json"), **named}
+        return {**self.config.model_dump(mode="json"), **self.selection.settings, **named}
 
     def clean(self, job: Job) -> Figures:
         """Reads one scan, cleans it, writes it with its picture, and returns its figures."""
         from pcdenoise import io
         from pcdenoise.commands.survey import traps
         from pcdenoise.denoising import denoiser
+        from pcdenoise.denoising.part import denoise_part
         from pcdenoise.evaluation.report import Page
 
         started = time.perf_counter()
         self.console.detail(f"{job.source}: reading")
         scan = io.read(job.source, format=format_of(job.source, self.format))
         with self.console.progress(job.source.name) as on_progress:
-            result = denoiser.denoise(scan.points, self.model, self.config, on_progress)
+            if self.selection == selection.Selection():
+                result = denoiser.denoise(scan.points, self.model, self.config, on_progress)
+            else:
+                result = denoise_part(scan.points, *self.selection.masks(scan), self.model, self.config, on_progress)
         for step in result.steps:
             self.console.detail(", ".join(f"{name.replace('_', ' ')} {figure(value)}" for name, value in step.figures.items()))
         check_drift(job.target, result.figures["drift"], result.figures["noise"], self.max_drift)
@@ -191,6 +201,8 @@ def _notes(result: Result) -> tuple[str, str]:
 def _summary(figures: Figures) -> str:
     """One line for a person: how many points, how noisy they were, how far they moved, what was left alone."""
     parts = [f"{figures['points']:,} points"]
+    if "points_selected" in figures:
+        parts.append(f"{figures['points_selected']:,} selected")
     parts.append(f"noise {figure(figures['noise'])}" if figures["is_surface"] else "no surface to clean")
     parts.append(f"moved {figure(figures['move_median'])} (median), at most {figure(figures['move_max'])}")
     if figures["points_left_alone"]:

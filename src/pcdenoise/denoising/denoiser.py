@@ -69,13 +69,20 @@ class Result:
     steps: list[Step] = field(default_factory=list)
 
 
-def denoise(points: Points, model: Model | None, config: DenoiseConfig, on_progress: Progress | None = None) -> Result:
+def denoise(
+    points: Points,
+    model: Model | None,
+    config: DenoiseConfig,
+    on_progress: Progress | None = None,
+    *,
+    level: NoiseLevel | None = None,
+) -> Result:
     """Moves (N, 3) float64 points onto the surface they were measured on; row i stays row i.
 
     Rows that are not finite stay as they are; exact duplicates move together; the network leaves a cloud in which no scale
     shows a surface as it is. Raises UsageError when the network is asked for without a model.
     """
-    cloud = _Cloud(points, config)
+    cloud = _Cloud(points, config, level)
     found = np.zeros(len(points), dtype=bool)
     if config.outliers != "keep" and len(cloud.start) >= FEWEST_POINTS:
         found = cloud.to_rows(outliers.find(cloud.start, threads=cloud.threads), False)
@@ -113,7 +120,7 @@ def iterate(points: Points, model: Model | None, config: DenoiseConfig) -> Itera
 class _Cloud:
     """The distinct finite points of an input in spatial order around their own origin, and the way back to its rows."""
 
-    def __init__(self, points: Points, config: DenoiseConfig) -> None:
+    def __init__(self, points: Points, config: DenoiseConfig, level: NoiseLevel | None = None) -> None:
         self.config, self.rows = config, points
         self.threads = config.threads or os.cpu_count() or 1
         self.finite: Mask = np.logical_and.reduce(np.isfinite(points), axis=1)
@@ -126,7 +133,7 @@ class _Cloud:
         back[order] = np.arange(len(order))
         self.start: Points = usable[first][order]
         self._row = back[place]
-        self.level: NoiseLevel = estimate(self.start, config.seed, self.threads)
+        self.level: NoiseLevel = level or estimate(self.start, config.seed, self.threads)
         self.diagonal = float(np.linalg.norm(np.ptp(self.start, axis=0))) if len(self.start) else 0.0
 
     def to_rows(self, values: NDArray[Any], missing: Any) -> NDArray[Any]:
