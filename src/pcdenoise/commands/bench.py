@@ -172,7 +172,8 @@ def _open3d_smoother(o3d: Any, name: str, arguments: tuple[Any, ...]) -> Smoothe
         import numpy as np
 
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-        smoothed: Points = np.asarray(getattr(cloud, name)(*arguments).points)
+        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+            smoothed: Points = np.asarray(getattr(cloud, name)(*arguments).points)
         return smoothed
 
     return smooth
