@@ -17,7 +17,7 @@ N_NEIGHBOURS = 16
 """Nearest points whose disc gives the density."""
 
 CPU_S, CPU_S_PER_POINT = 2.5, 40e-6
-BYTES, BYTES_PER_POINT = 0.3e9, 3400
+BYTES, BYTES_PER_POINT = 0.42e9, 1300
 """Cost of one pass of the shipped model on a common core: a line through what `/usr/bin/time -v` says of 100K and 400K points."""
 
 _MOST_JUDGED = 200_000  # points of which outliers are counted
