@@ -73,9 +73,13 @@ def bench(
         print(_as_text(source, rows, times, trial), end="\n\n" if len(inputs) > 1 else "\n")
     if report:
         settings = {"models": model, "added": times, "points": points, "seed": seed, "threads": threads}
-        tables = {"Methods": [{"input": record["input"], **record["figures"]} for record in records]}
+        tables = {"Methods": _by_method(records)}
         page: Page = Page(tables=tables, lead="Distance of cleaned points from a surface through points that no method saw.")
-        outputs.save_report(report, "bench", settings, records, page, overwrite=overwrite)
+        figures = {
+            "scans": len({record["input"] for record in records}),
+            "methods": len({row["method"] for row in tables["Methods"]}),
+        }
+        outputs.save_report(report, "bench", settings, records, page, figures=figures, overwrite=overwrite)
 
 
 @dataclass(frozen=True)
@@ -177,6 +181,17 @@ def _open3d_smoother(o3d: Any, name: str, arguments: tuple[Any, ...]) -> Smoothe
         return smoothed
 
     return smooth
+
+
+def _by_method(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row for each scan and method, its errors side by side."""
+    rows: dict[tuple[str, str], dict[str, Any]] = {}
+    for record in records:
+        figures = record["figures"]
+        row = rows.setdefault((record["input"], figures["method"]), {"input": record["input"], "method": figures["method"]})
+        row[f"error +{figures['added']:g}x"] = figures["error"]
+        row |= {"cpu_s": round(figures["cpu_s"], 3), "spacing_variation": figures["spacing_variation"]}
+    return list(rows.values())
 
 
 def _as_text(source: Path, rows: list[dict[str, Any]], times: list[float], trial: _Trial) -> str:
