@@ -4,7 +4,7 @@ PIP := .venv/bin/python -m pip --disable-pip-version-check
 BIN := .venv/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types docs bench clean
+.PHONY: help setup demo test lint types docs site bench clean
 
 help: ## list the verbs
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -32,6 +32,9 @@ docs: .venv/dev.stamp demo ## rebuild the command reference and the README's pic
 	$(BIN)/python docs/reference.py
 	cp demo/before_after.png docs/images/
 	$(BIN)/python -m pytest tests/test_docs.py
+
+site: .venv/dev.stamp ## docs/ as web pages, in build/site
+	$(BIN)/mkdocs build --strict
 
 bench: .venv/run.stamp ## the shipped model and a classical filter on shapes whose surface is known
 	$(BIN)/pcdenoise synth shapes:3 -o demo/bench --points 10000 --levels 1 --seed 1 --overwrite

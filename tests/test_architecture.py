@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted((ROOT / "src" / "pcdenoise").rglob("*.py"))
-COMMANDS = ["denoise", "info", "iterate", "verify", "undo", "models", "synth", "train", "eval-chamfer"]
+COMMANDS = ["denoise", "info", "bench", "iterate", "verify", "undo", "models", "synth", "train", "eval-chamfer"]
 HEAVY = {"torch", "open3d", "scipy", "laspy", "plyfile", "safetensors", "numpy"}
 
 _REPORT_MODULES = """

@@ -106,7 +106,7 @@ def test_an_attribute_of_the_file_can_be_replaced() -> None:
 def test_moved_coordinates_keep_the_decimals_of_their_column_but_resolve_a_millionth_of_the_extent() -> None:
     raw = b"0.0 0.000000 5\n1000.0 1.000000 6\n2000.0 2.000000 7\n"
     scan = xyz.read(raw, "sample")
-    moved = written(scan.moved_to(scan.points + 0.123456789)).splitlines()
+    moved = written(scan.moved_to(scan.points + 0.12345678901234)).splitlines()
     assert moved[1] == b"1000.123 1.123457 6.123"
 
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from pcdenoise.api import denoise as denoise
     from pcdenoise.cloud.scan import Scan as Scan
     from pcdenoise.config import DenoiseConfig as DenoiseConfig
     from pcdenoise.config import TrainConfig as TrainConfig
-    from pcdenoise.denoising.denoiser import denoise as denoise
     from pcdenoise.evaluation.chamfer import evaluate as evaluate
     from pcdenoise.io import read as read
     from pcdenoise.io import write as write
@@ -22,7 +22,7 @@ _HOMES = {
     "DenoiseConfig": ("pcdenoise.config", "DenoiseConfig"),
     "Scan": ("pcdenoise.cloud.scan", "Scan"),
     "TrainConfig": ("pcdenoise.config", "TrainConfig"),
-    "denoise": ("pcdenoise.denoising.denoiser", "denoise"),
+    "denoise": ("pcdenoise.api", "denoise"),
     "evaluate": ("pcdenoise.evaluation.chamfer", "evaluate"),
     "load_model": ("pcdenoise.networks.store", "load"),
     "read": ("pcdenoise.io", "read"),

@@ -24,6 +24,10 @@ _CERTAIN_ASPECT, _SMALL_SHARE = 4.4, 1 / 40
 """A surface shows in a small share of the cloud, or more clearly than a solid ball, cube or blob ever does: those have up to 4.3,
 once a neighbourhood is half of them."""
 _CLEARER_SHARE = 0.3  # this share of all places must show it: edges and thin parts stay thick at any scale
+_SEEN = ([3.0, 3.7, 4.1, 4.7, 5.2, 6.1, 8.0], [0.72, 0.82, 0.86, 0.9, 0.92, 0.94, 0.95])
+N_PLACES = 4000
+"""Places at which `around` looks."""
+_FEWEST_AROUND, _MOST_AROUND = 32, 1024
 _SCALE_STDS = 4.5  # the radius of the neighbourhood of `scale_points`
 
 
@@ -77,6 +81,40 @@ def estimate(points: Points, seed: int = 0, threads: int = -1) -> NoiseLevel:
     return NoiseLevel(std, spacing, _points_within(_SCALE_STDS * std, rungs), certain)
 
 
+def around(points: Points, level: NoiseLevel, at: Points | None = None, seed: int = 0, threads: int = -1) -> NDArray[np.float64]:
+    """(M,) noise std of (N, 3) finite points around each of (M, 3) places, the points themselves if not given.
+
+    The map to the one number of `estimate`; NaN where no surface shows.
+
+    At up to N_PLACES points of even spread neighbourhoods grow from the cloud's own scale until they show a surface, and hold
+    what a quadric leaves in them. Each point gets the root mean square of the three places nearest to it.
+    """
+    at = points if at is None else at
+    values = np.full(len(at), np.nan)
+    rows = distinct(points)[0]
+    if len(rows) < _LADDER[0]:
+        return values
+    cloud = points[rows][spatial_order(points[rows])]
+    rng = np.random.default_rng(seed)
+    places = cloud[np.sort(rng.choice(len(cloud), size=min(N_PLACES, len(cloud)), replace=False))]
+    search = NeighbourSearch(cloud, threads)
+    std = np.full(len(places), np.nan)
+    first = min(max(2 * level.scale_points, _FEWEST_AROUND), _MOST_AROUND / 4)
+    for k in (round(first), round(2 * first), round(4 * first)):
+        for block in np.array_split(np.flatnonzero(np.isnan(std)), max(1, len(places) * k // _PROBED)):
+            distances, indices = search.knn(places[block], k)
+            radius = np.maximum(distances[:, -1], 1e-300)
+            aspect = 1 / np.maximum(_quadric_residual(cloud, places[block], radius, indices), 1e-6)
+            shown = aspect >= _CERTAIN_ASPECT
+            std[block[shown]] = (radius / aspect)[shown] / np.interp(aspect[shown], *_SEEN)
+    nearest = NeighbourSearch(places, threads).knn(at, 3)[1]
+    known = ~np.isnan(std[nearest])
+    n_known = known.sum(axis=1)
+    squared = np.where(known, np.nan_to_num(std[nearest]) ** 2, 0).sum(axis=1)
+    values[n_known > 0] = np.sqrt(squared[n_known > 0] / n_known[n_known > 0])
+    return values
+
+
 def _points_within(radius: float, rungs: list[_Rung]) -> float:
     """How many points so large a ball holds; below the first rung their number grows as the radius squared."""
     if radius <= rungs[0].radius:
@@ -94,7 +132,7 @@ class _Rung:
 
 def _share_seen(aspect: float) -> float:
     """How much of the noise a neighbourhood holds: the ball around a noisy point cuts its tails (measured on noisy planes)."""
-    return float(np.interp(aspect, [3.0, 3.7, 4.1, 4.7, 5.2, 6.1, 8.0], [0.72, 0.82, 0.86, 0.9, 0.92, 0.94, 0.95]))
+    return float(np.interp(aspect, *_SEEN))
 
 
 def _quadric_residual(points: Points, centres: Points, radius: NDArray[np.float64], indices: Indices) -> NDArray[np.float64]:

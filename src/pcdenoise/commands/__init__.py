@@ -15,6 +15,7 @@ import typer
 
 from pcdenoise import __version__
 from pcdenoise.commands import (
+    bench,
     denoise,
     eval_chamfer,
     info,
@@ -42,6 +43,7 @@ app = typer.Typer(name="pcdenoise", no_args_is_help=True, pretty_exceptions_enab
 _COMMANDS: dict[str, Callable[..., None]] = {
     "denoise": denoise.denoise,
     "info": info.info,
+    "bench": bench.bench,
     "iterate": iterate.iterate,
     "verify": verify.verify,
     "undo": undo.undo,

@@ -8,12 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pcdenoise.commands import options, outputs
+from pcdenoise.commands import options, outputs, selection
 from pcdenoise.commands.batch import Batch, Figures
 from pcdenoise.commands.console import Console, figure, table
 from pcdenoise.commands.files import Job, expand, format_of, plan, refuse_existing
 from pcdenoise.commands.options import configured, option
 from pcdenoise.commands.undo import with_displacement
+from pcdenoise.commands.verify import MaxDrift, check_drift
 from pcdenoise.errors import UsageError
 
 if TYPE_CHECKING:
@@ -52,9 +53,13 @@ def denoise(
     sigma_n: SigmaN = None,
     strength: Annotated[float, option("--strength", help="Share of the move that is made, 0 to 1.")] = 1.0,
     max_move: Annotated[float | None, option("--max-move", help="Longest move of a point, in the file's unit.")] = None,
+    max_drift: MaxDrift = None,
     outliers: Annotated[
         Literal["keep", "flag", "remove"], option("--outliers", help="Points far from any surface: keep, mark, or leave out.")
     ] = "keep",
+    only_class: selection.OnlyClass = "",
+    context: selection.Context = "class",
+    roi: selection.Roi = "",
     displacement: Annotated[
         bool, option("--displacement", help="Store where each point was and how far it moved; undo needs it.")
     ] = False,
@@ -94,9 +99,11 @@ def denoise(
     jobs = plan(sources, output, suffix=suffix, format=format)
     pictures = {job.source: job.target for job in plan(sources, str(picture), format="png")} if picture else {}
     refuse_existing([*(job.target for job in jobs), *pictures.values(), report], overwrite)
+    chosen = selection.Selection.of(only_class, context, roi)
     cleaning = _Cleaning(
-        settings, chosen_model(model, settings), console, format, overwrite, drop_attributes, displacement, pictures
-    )
+        settings, chosen, chosen_model(model, settings), console, format, overwrite, drop_attributes, displacement, max_drift,
+        pictures,
+    )  # fmt: skip
     batch = Batch(console)
     batch.run(jobs, cleaning.clean)
     if report:
@@ -121,12 +128,14 @@ class _Cleaning:
     """What is the same for every scan of a run: how to clean, what to write, and pages of the last scan for its report."""
 
     config: DenoiseConfig
+    selection: selection.Selection
     model: Model | None
     console: Console
     format: str | None
     overwrite: bool
     drop_attributes: bool
     displacement: bool
+    max_drift: float | None
     pictures: dict[Path, Path]
     pages: list[Page] = field(default_factory=list)
 
@@ -134,22 +143,27 @@ class _Cleaning:
     def settings(self) -> dict[str, Any]:
         """Everything that shaped the result, by name, for the report and the file's provenance."""
         named = {"model": self.model.name, "model_sha256": self.model.sha256} if self.model else {}
-        return {**self.config.model_dump(mode="json"), **named}
+        return {**self.config.model_dump(mode="json"), **self.selection.settings, **named}
 
     def clean(self, job: Job) -> Figures:
         """Reads one scan, cleans it, writes it with its picture, and returns its figures."""
         from pcdenoise import io
-        from pcdenoise.commands.info import coordinate_step
+        from pcdenoise.commands.survey import traps
         from pcdenoise.denoising import denoiser
+        from pcdenoise.denoising.part import denoise_part
         from pcdenoise.evaluation.report import Page
 
         started = time.perf_counter()
         self.console.detail(f"{job.source}: reading")
         scan = io.read(job.source, format=format_of(job.source, self.format))
         with self.console.progress(job.source.name) as on_progress:
-            result = denoiser.denoise(scan.points, self.model, self.config, on_progress)
+            if self.selection == selection.Selection():
+                result = denoiser.denoise(scan.points, self.model, self.config, on_progress)
+            else:
+                result = denoise_part(scan.points, *self.selection.masks(scan), self.model, self.config, on_progress)
         for step in result.steps:
             self.console.detail(", ".join(f"{name.replace('_', ' ')} {figure(value)}" for name, value in step.figures.items()))
+        check_drift(job.target, result.figures["drift"], result.figures["noise"], self.max_drift)
         job.target.parent.mkdir(parents=True, exist_ok=True)
         io.write(
             self._marked(scan, result), job.target, format=format_of(job.target, self.format), overwrite=self.overwrite,
@@ -159,11 +173,8 @@ class _Cleaning:
         if picture := self.pictures.get(job.source):
             outputs.save_before_after(picture, scan, result.points, notes=_notes(result), overwrite=self.overwrite)
         self.pages[:] = [Page(scan.points, result.points, colours=outputs.colours(scan))]
-        grid = coordinate_step(scan)
-        if grid and 0 < figures["move_median"] < grid / 2:
-            self.console.note(
-                f"{job.target}: most moves are below the file's step of {grid:g} and vanish; write .ply to keep them"
-            )
+        for text in traps(scan, figures["noise"] if figures["is_surface"] else None):
+            self.console.note(f"{job.source}: {text}")
         self.console.note(f"{job.target}: {_summary(figures)}" + (f"; picture {picture}" if picture else ""))
         return figures
 
@@ -190,6 +201,8 @@ def _notes(result: Result) -> tuple[str, str]:
 def _summary(figures: Figures) -> str:
     """One line for a person: how many points, how noisy they were, how far they moved, what was left alone."""
     parts = [f"{figures['points']:,} points"]
+    if "points_selected" in figures:
+        parts.append(f"{figures['points_selected']:,} selected")
     parts.append(f"noise {figure(figures['noise'])}" if figures["is_surface"] else "no surface to clean")
     parts.append(f"moved {figure(figures['move_median'])} (median), at most {figure(figures['move_max'])}")
     if figures["points_left_alone"]:
@@ -202,10 +215,10 @@ def _summary(figures: Figures) -> str:
 def _plan_text(sources: list[Path], output: str, suffix: str, format: str | None, settings: DenoiseConfig) -> str:
     """What a run would do, input by input, after a look at each."""
     from pcdenoise import io
-    from pcdenoise.commands.info import survey
+    from pcdenoise.commands.survey import cost, cost_text, survey
 
     jobs = plan(sources, output, suffix=suffix, format=format) if output else [Job(source, Path("?")) for source in sources]
-    rows = []
+    rows, warnings = [], []
     for job in jobs:
         found = survey(io.read(job.source, format=format_of(job.source, format)), seed=settings.seed)
         noise = figure(found["noise"]) if found.get("is_surface") else "no surface"
@@ -216,7 +229,9 @@ def _plan_text(sources: list[Path], output: str, suffix: str, format: str | None
                 figure(found.get("spacing", 0.0)),
                 noise,
                 str(settings.iters),
+                cost_text(cost(found["points"], 3 if settings.iters == "auto" else settings.iters)),
                 str(job.target),
             ]
         )
-    return table(["input", "points", "spacing", "noise", "passes", "output"], rows)
+        warnings += [f"warning: {job.source}: {text}" for text in found["warnings"]]
+    return "\n".join([table(["input", "points", "spacing", "noise", "passes", "cost", "output"], rows), *warnings])

@@ -1,48 +1,69 @@
-"""`pcdenoise info`: what a scan is and how noisy it is. Not here: how the noise is estimated (cloud.noise_level)."""
+"""`pcdenoise info`: what a scan is and how noisy it is. Not here: the facts themselves (survey.py)."""
 
 from __future__ import annotations
 
 import json
-import math
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pcdenoise.commands import options
 from pcdenoise.commands.batch import Batch, Figures
 from pcdenoise.commands.console import Console, facts, figure
-from pcdenoise.commands.files import Job, attachments, expand, format_of
+from pcdenoise.commands.files import Job, expand, format_of, plan, refuse_existing
+from pcdenoise.commands.options import option
+from pcdenoise.commands.survey import cost_text, survey
 
 if TYPE_CHECKING:
-    from pcdenoise.cloud.scan import Scan
+    import numpy as np
+    from numpy.typing import NDArray
 
-N_NEIGHBOURS = 16
-"""Nearest points whose disc gives the density."""
+    from pcdenoise.cloud.scan import Scan
 
 
 def info(
     inputs: options.Inputs,
+    picture: Annotated[
+        str, option("--picture", metavar="OUT", help="Draw where the noise is: a .png, or a folder for several.")
+    ] = "",
+    noise_map: Annotated[
+        str, option("--noise-map", metavar="OUT", help="Write the scan with a column noise: a file, or a folder for several.")
+    ] = "",
     format: options.Format = None,
     as_json: options.Json = False,
+    overwrite: options.Overwrite = False,
     config: options.Config = None,
     seed: options.Seed = 0,
     threads: options.Threads = None,
 ) -> None:
-    """Say what scans are and how noisy: points, extent, spacing, density, noise, attributes, and how to clean them.
+    """Say what scans are and how noisy: extent, spacing, density, noise and where it is, traps, and how to clean them.
 
-    Example: pcdenoise info scan.laz
+    Example: pcdenoise info scan.laz --picture noise.png
     """
     from pcdenoise import io
 
     batch = Batch(Console())
+    sources = expand(inputs)
+    pictures = {job.source: job.target for job in plan(sources, picture, suffix="_noise", format="png")} if picture else {}
+    maps = {job.source: job.target for job in plan(sources, noise_map, suffix="_noise")} if noise_map else {}
+    refuse_existing([*pictures.values(), *maps.values()], overwrite)
 
     def describe(job: Job) -> Figures:
-        facts_ = survey(io.read(job.source, format=format_of(job.source, format)), seed=seed, threads=threads or -1)
+        scan = io.read(job.source, format=format_of(job.source, format))
+        found = survey(scan, seed=seed, threads=threads or -1)
         if not as_json:
-            print(_as_text(job.source, facts_), end="\n\n" if len(jobs) > 1 else "\n")
-        return facts_
+            print(_as_text(job.source, found), end="\n\n" if len(jobs) > 1 else "\n")
+        if job.source in {**pictures, **maps}:
+            noise = _noise_of_rows(scan, seed, threads or -1)
+            if target := pictures.get(job.source):
+                _draw(target, scan, noise, overwrite)
+            if target := maps.get(job.source):
+                target.parent.mkdir(parents=True, exist_ok=True)
+                marked = scan.with_attributes(noise=noise.astype("f4"))
+                io.write(marked, target, format=format_of(target, format), overwrite=overwrite)
+        return found
 
-    jobs = [Job(source, source) for source in expand(inputs)]
+    jobs = [Job(source, source) for source in sources]
     batch.run(jobs, describe)
     if as_json:
         done = [{"input": record["input"], **record["figures"]} for record in batch.records if record["status"] == "done"]
@@ -50,60 +71,30 @@ def info(
     batch.close()
 
 
-def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
-    """Facts of a scan in its own unit: counts, extent, spacing, density (points per unit of surface), noise, attributes."""
+def _noise_of_rows(scan: Scan, seed: int, threads: int) -> NDArray[np.float64]:
+    """(N,) noise std around each row, NaN where no surface shows or the row has no coordinates."""
     import numpy as np
 
     from pcdenoise.cloud import noise_level
-    from pcdenoise.cloud.neighbours import NeighbourSearch
 
     points = scan.points[scan.finite]
-    extent = np.ptp(points, axis=0) if len(points) else np.zeros(3)
-    distinct = np.unique(points, axis=0)
-    facts_: dict[str, Any] = {
-        "format": scan.format,
-        "points": len(scan),
-        "not_finite": len(scan) - len(points),
-        "duplicates": len(points) - len(distinct),
-        "low": points.min(axis=0).tolist() if len(points) else None,
-        "high": points.max(axis=0).tolist() if len(points) else None,
-        "extent": extent.tolist(),
-        "diagonal": float(np.linalg.norm(extent)),
-        "attributes": {name: str(values.dtype) for name, values in scan.attributes.items()},
-        "beside": attachments(scan),
-        "coordinate_step": coordinate_step(scan),
-    }
-    if len(distinct) < 2:
-        return facts_
+    values = np.full(len(scan), np.nan)
     level = noise_level.estimate(points, seed=seed, threads=threads)
-    probes = distinct[
-        np.random.default_rng(seed).choice(len(distinct), size=min(noise_level.N_PROBES, len(distinct)), replace=False)
-    ]
-    k = min(N_NEIGHBOURS, len(distinct))
-    radius = float(np.median(NeighbourSearch(distinct, threads).knn(probes, k)[0][:, -1]))
-    return facts_ | {
-        "spacing": level.spacing,
-        "density": (k - 1) / (math.pi * radius**2),
-        "noise": level.std,
-        "noise_share_of_diagonal": level.std / facts_["diagonal"],
-        "is_surface": level.is_surface,
-        "scale_points": level.scale_points,
-    }
+    values[scan.finite] = noise_level.around(points, level, seed=seed, threads=threads)
+    return values
 
 
-def coordinate_step(scan: Scan) -> float | None:
-    """The power of ten, 1 to 1e-8, that all coordinates are multiples of (LAS, decimals of a text), from up to 10 000 rows."""
-    import numpy as np
+def _draw(path: Path, scan: Scan, noise: NDArray[np.float64], overwrite: bool) -> None:
+    from pcdenoise.evaluation.colours import Scalar
+    from pcdenoise.evaluation.pictures import render, write_png
 
-    some = scan.points[scan.finite][:: max(1, len(scan) // 10_000)]
-    for decimals in range(9) if len(some) else ():
-        scaled = some * 10.0**decimals
-        if (np.abs(scaled - np.rint(scaled)) <= 1e-6 + 8 * np.finfo(np.float64).eps * np.abs(scaled)).all():
-            return float(10.0**-decimals)
-    return None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_png(path, render(scan.points, colour=Scalar(noise, "Noise")), overwrite=overwrite)
 
 
 def _as_text(path: Path, found: dict[str, Any]) -> str:
+    from pcdenoise.io.crs import Crs
+
     pairs = [
         ("file", f"{path} ({found['format']})"),
         (
@@ -118,13 +109,27 @@ def _as_text(path: Path, found: dict[str, Any]) -> str:
             ("density", f"{figure(found['density'])} points per square unit of surface"),
             ("noise", _noise(found)),
         ]
+        if found["noise_p5"] is not None:
+            shown = f"; a surface shows around {found['surface_share']:.0%} of the points"
+            pairs.append(("noise map", f"{figure(found['noise_p5'])} to {figure(found['noise_p95'])} at 5 % and 95 %{shown}"))
+        pairs.append(("outliers", f"{found['outlier_share']:.3%} of the points"))
+    if system := found["crs"]:
+        pairs.append(("system", str(Crs(**system))))
     if step := found["coordinate_step"]:
-        pairs.append(("step", f"{step:g}: coordinates are multiples of it, moves below half of it vanish"))
+        pairs.append(("step", f"{step:g}: coordinates are multiples of it, {_step_share(found)}"))
     names = ", ".join(f"{name} ({dtype})" for name, dtype in found["attributes"].items())
     pairs.append(("attributes", names or "none"))
     if found["beside"]:
         pairs.append(("beside them", ", ".join(found["beside"])))
+    pairs += [("warning", text) for text in found["warnings"]]
+    if found.get("is_surface"):
+        pairs.append(("cost", f"{cost_text(found)} for a pass with the default model; one pass does nearly all"))
     return facts([*pairs, ("next", _suggestion(path, found))])
+
+
+def _step_share(found: dict[str, Any]) -> str:
+    share = found.get("noise", 0.0) / found["coordinate_step"]
+    return f"the noise is {figure(share)} of them" if found.get("is_surface") else "moves below half of it vanish"
 
 
 def _but(count: int, what: str) -> str:
@@ -135,7 +140,9 @@ def _noise(found: dict[str, Any]) -> str:
     if not found["is_surface"]:
         return "no surface at any scale: leaves, clutter, a filled volume, or too few points to tell"
     spacings = found["noise"] / found["spacing"]
-    return f"{figure(found['noise'])} ({found['noise_share_of_diagonal']:.3%} of the diagonal, {spacings:.2g} spacings)"
+    unit = (found["crs"] or {}).get("unit", "")
+    share = f"{found['noise_share_of_diagonal']:.3%} of the diagonal, {spacings:.2g} spacings"
+    return f"{figure(found['noise'])}{' ' if unit else ''}{unit} ({share})"
 
 
 def _suggestion(path: Path, found: dict[str, Any]) -> str:

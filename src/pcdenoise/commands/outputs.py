@@ -32,11 +32,13 @@ def save_report(
     page: Page | None,
     *,
     overwrite: bool,
+    figures: Mapping[str, Any] | None = None,
 ) -> None:
-    """Writes a report of schema `pcdenoise-report/1`; the figures of a single input are also those of the run."""
+    """Writes a report of schema `pcdenoise-report/1`; without figures of the run they are those of a single input."""
     from pcdenoise.evaluation.report import write_report
 
-    figures = files[0].get("figures", {}) if len(files) == 1 else {"inputs": len(files), "failed": n_failed(files)}
+    if figures is None:
+        figures = files[0].get("figures", {}) if len(files) == 1 else {"inputs": len(files), "failed": n_failed(files)}
     report = {"command": command, "version": __version__, "settings": settings, "figures": figures, "files": files}
     write_report(path, report, page, overwrite=overwrite)
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pcdenoise.commands import options
+from pcdenoise.commands import options, outputs
 from pcdenoise.commands.console import Console
 from pcdenoise.commands.files import refuse_existing
 from pcdenoise.commands.options import configured, option
@@ -64,6 +66,7 @@ def train(
     budget: Annotated[str | None, option("--budget", metavar="TIME", help="Stop after so long: 90s, 20m, 1.5h.")] = None,
     init: Annotated[str | None, option("--init", metavar="NAME|DIR", help="Start from this model.")] = None,
     resume: Annotated[bool, option("--resume", help="Go on where an interrupted run in the same folder stopped.")] = False,
+    report: options.Report = None,
     overwrite: options.Overwrite = False,
     config: options.Config = None,
     seed: options.Seed = 1,
@@ -83,10 +86,27 @@ def train(
         steps=steps, budget_s=_seconds(budget), seed=seed, threads=threads,
     )  # fmt: skip
     refuse_existing([output / "config.json"], overwrite or resume)
+    refuse_existing([report], overwrite)
     console = Console(quiet)
     with console.progress("train") as on_progress:
         summary = trainer.train(settings, output, init=init, resume=resume, on_progress=on_progress)
+    if report:
+        _save_report(report, output, settings.model_dump(mode="json"), asdict(summary), overwrite)
     console.note(f"{output}: {summary}")
+
+
+def _save_report(path: Path, output: Path, settings: dict[str, Any], figures: dict[str, Any], overwrite: bool) -> None:
+    """Figures and settings of a run, as HTML with its curve."""
+    from pcdenoise.evaluation.charts import curve
+    from pcdenoise.evaluation.report import Page
+    from pcdenoise.learning.trainer import LOG
+
+    log = output / LOG
+    lines = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
+    errors = {"": [line["error"] for line in lines]}
+    chart = curve(errors, title="Error, of the noise", x_label="Step", x=[line["step"] for line in lines])
+    files = [{"input": ", ".join(settings["data"] or []), "output": str(output), "status": "done", "figures": figures}]
+    outputs.save_report(path, "train", settings, files, Page(charts=[chart]), overwrite=overwrite)
 
 
 def _seconds(text: str | None) -> float | None:

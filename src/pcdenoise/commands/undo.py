@@ -28,6 +28,9 @@ def undo(
 ) -> None:
     """Take a cleaned scan back to the original, exactly; needs a scan written by denoise --displacement.
 
+    The columns that it added and the note on how it was made go too: a LAS, binary PLY or binary PCD is the original byte for
+    byte. Compressed files hold the same and may be packed otherwise; a number in a text may lose zeros at its end.
+
     Example: pcdenoise undo clean.laz -o original.laz
     """
     from pcdenoise import io
@@ -48,16 +51,18 @@ def with_displacement(before: Points, after: Scan) -> Scan:
 
 
 def restored(scan: Scan) -> Scan:
-    """The scan before it was moved; the four columns stay, the displacement at zero. Raises ScanError if they are not there.
+    """The scan before it was moved, without the four columns. Raises ScanError if they are not there.
 
     A text without a header does not keep names: there the last four columns are taken, if they agree with the coordinates.
     """
     import numpy as np
 
+    from pcdenoise import io
+
     names = [*ORIGINAL, DISPLACEMENT]
     if set(names) <= set(scan.attributes) or (names := _last_columns(scan)):
         before = np.stack([scan.attributes[name].astype(np.float64) for name in names[:3]], axis=1)
-        return scan.moved_to(before).with_attributes(**{names[3]: np.zeros_like(scan.attributes[names[3]])})
+        return io.without(scan, names).moved_to(before)
     raise ScanError(f"{scan.origin}: no places before the move are stored; only what denoise --displacement wrote can be undone")
 
 

@@ -10,25 +10,36 @@ import typer
 
 from pcdenoise.commands import options
 from pcdenoise.commands.console import figure, table
-from pcdenoise.commands.files import attachments, format_of
+from pcdenoise.commands.files import format_of
 from pcdenoise.commands.options import option
 from pcdenoise.errors import GateError
 
 if TYPE_CHECKING:
     from pcdenoise.cloud.scan import Scan
 
+MaxDrift = Annotated[
+    float | None,
+    option(
+        "--max-drift", min=0, help="Fail if the surface itself moved, by more than so many times the noise; 0.3 is a good limit."
+    ),
+]
+
 
 def verify(
     before: Annotated[Path, typer.Argument(metavar="BEFORE", help="The scan that went in.")],
     after: Annotated[Path, typer.Argument(metavar="AFTER", help="The scan that came out.")],
     max_move: Annotated[float | None, option("--max-move", help="Fail if a point moved farther, in the file's unit.")] = None,
+    max_drift: MaxDrift = None,
     format: options.Format = None,
     as_json: options.Json = False,
     config: options.Config = None,
 ) -> None:
     """Prove that every row and attribute survived, byte for byte, and say how far points moved. Exit code 5 if not.
 
-    Example: pcdenoise verify scan.laz clean.laz --max-move 0.05
+    Compared are all columns, and what is beside them: VLRs and EVLRs of LAS with their content, faces of PLY, a viewpoint.
+    Drift is how far the surface moved as a whole: removing noise moves points to both sides and leaves it near 0.
+
+    Example: pcdenoise verify scan.laz clean.laz --max-move 0.05 --max-drift 0.3
     """
     from pcdenoise import io
 
@@ -38,15 +49,30 @@ def verify(
         raise GateError(f"{after}: not everything of {before} survived: {'; '.join(findings['lost'])}")
     if max_move is not None and findings["move"]["max"] > max_move:
         raise GateError(f"{after}: a point moved by {figure(findings['move']['max'])}, the limit is {figure(max_move)}")
+    if findings["drift"] is not None:
+        check_drift(after, findings["drift"], findings["noise_before"], max_drift)
+
+
+def check_drift(path: Path, drift: float, noise: float, limit: float | None) -> None:
+    """Raises GateError if a surface drifted by more than `limit` times the noise that was to be removed."""
+    if limit is not None and drift > limit * noise:
+        share = f", {figure(drift / noise)} of the noise" if noise > 0 else " without any noise"
+        fix = "use fewer passes, less --strength or another --method"
+        raise GateError(f"{path}: the surface drifted by {figure(drift)}{share}; the limit is {figure(limit)}; {fix}")
 
 
 def compare(before: Scan, after: Scan) -> dict[str, Any]:
-    """What two scans share: attributes row by row, what is beside them, distances moved, and a list of what was lost."""
+    """What two scans share: attributes row by row, what is beside them, distances moved, drift, and a list of what was lost."""
     import numpy as np
+
+    from pcdenoise.cloud import drift, noise_level
 
     if len(before) != len(after):
         lost = [f"{len(before)} rows became {len(after)}"]
-        return {"rows": [len(before), len(after)], "attributes": {}, "beside": {}, "added": [], "move": {}, "lost": lost}
+        return {
+            "rows": [len(before), len(after)], "attributes": {}, "beside": {}, "added": [], "move": {},
+            "drift": None, "drift_inward": None, "noise_before": None, "lost": lost,
+        }  # fmt: skip
     attributes = {}
     for name, values in before.attributes.items():
         other = after.attributes.get(name)
@@ -58,12 +84,18 @@ def compare(before: Scan, after: Scan) -> dict[str, Any]:
             n_changed = int(_rows_that_differ(values, other).sum())
             attributes[name] = f"{n_changed} rows changed" if n_changed else "same"
     lost = [f"{name}: {verdict}" for name, verdict in attributes.items() if verdict != "same"]
-    beside = {name: name in attachments(after) for name in attachments(before)}
-    lost += [f"{name}: missing" for name, there in beside.items() if not there]
+    kept = _payloads(after)
+    beside = {
+        name: "missing" if name not in kept else "same" if kept[name] == payload else "changed"
+        for name, payload in _payloads(before).items()
+    }
+    lost += [f"{name}: {verdict}" for name, verdict in beside.items() if verdict != "same"]
     if not np.array_equal(before.finite, after.finite):
         lost.append("rows without numbers (NaN, infinite) are not the same rows")
     both = before.finite & after.finite
     move = np.linalg.norm(after.points[both] - before.points[both], axis=1)
+    level = noise_level.estimate(before.points[both])
+    drifted = drift.measure(before.points[both], after.points[both])
     return {
         "rows": [len(before), len(after)],
         "attributes": attributes,
@@ -75,8 +107,15 @@ def compare(before: Scan, after: Scan) -> dict[str, Any]:
             "p95": float(np.quantile(move, 0.95)) if len(move) else 0.0,
             "max": float(move.max(initial=0.0)),
         },
+        "drift": drifted.size,
+        "drift_inward": drifted.inward,
+        "noise_before": level.std,
         "lost": lost,
     }
+
+
+def _payloads(scan: Scan) -> dict[str, bytes]:
+    return scan.source.payloads() if scan.source is not None else {}
 
 
 def _rows_that_differ(values: Any, other: Any) -> Any:
@@ -92,7 +131,11 @@ def _as_text(findings: dict[str, Any]) -> str:
     n_before, n_after = findings["rows"]
     rows = [["rows", f"{n_before:,}" if n_before == n_after else f"{n_before:,} -> {n_after:,}"]]
     rows += [[name, verdict] for name, verdict in findings["attributes"].items()]
-    rows += [[name, "there" if there else "missing"] for name, there in findings["beside"].items()]
+    rows += [[name, verdict] for name, verdict in findings["beside"].items()]
     rows += [[name, "added"] for name in findings["added"]]
     rows += [[f"move, {name}", f"{value:.1%}" if name == "share" else figure(value)] for name, value in findings["move"].items()]
+    if (drift := findings["drift"]) is not None:
+        noise = findings["noise_before"]
+        share = f", {figure(drift / noise)} of the noise before" if noise > 0 else ""
+        rows += [["drift", f"{figure(drift)}{share}"], ["drift, inward", figure(findings["drift_inward"])]]
     return table(["what", "before and after"], rows, left={0, 1})

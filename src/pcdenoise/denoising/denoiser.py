@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pcdenoise.cloud import drift
 from pcdenoise.cloud.neighbours import distinct, spatial_order
 from pcdenoise.cloud.noise_level import NoiseLevel, estimate
 from pcdenoise.cloud.scan import Mask, Points
@@ -70,13 +71,20 @@ class Result:
     steps: list[Step] = field(default_factory=list)
 
 
-def denoise(points: Points, model: Model | None, config: DenoiseConfig, on_progress: Progress | None = None) -> Result:
+def denoise(
+    points: Points,
+    model: Model | None,
+    config: DenoiseConfig,
+    on_progress: Progress | None = None,
+    *,
+    level: NoiseLevel | None = None,
+) -> Result:
     """Moves (N, 3) float64 points onto the surface they were measured on; row i stays row i.
 
     Rows that are not finite stay as they are; exact duplicates move together; the network leaves a cloud in which no scale
     shows a surface as it is. Raises UsageError when the network is asked for without a model.
     """
-    cloud = _Cloud(points, config)
+    cloud = _Cloud(points, config, level)
     found = np.zeros(len(points), dtype=bool)
     if config.outliers != "keep" and len(cloud.start) >= FEWEST_POINTS:
         found = cloud.to_rows(outliers.find(cloud.start, threads=cloud.threads), False)
@@ -84,6 +92,7 @@ def denoise(points: Points, model: Model | None, config: DenoiseConfig, on_progr
     moved = steps[-1].points if steps else cloud.start
     unmoved = cloud.unmoved(moved)
     length = np.linalg.norm(moved - cloud.start, axis=1) if len(moved) else np.zeros(1)
+    drifted = drift.measure(cloud.start, moved, config.seed, cloud.threads)
     figures = {
         "noise": cloud.level.std,
         "spacing": cloud.level.spacing,
@@ -92,6 +101,8 @@ def denoise(points: Points, model: Model | None, config: DenoiseConfig, on_progr
         "move_median": float(np.median(length)),
         "move_p99": float(np.quantile(length, 0.99)),
         "move_max": float(length.max()),
+        "drift": drifted.size,
+        "drift_inward": drifted.inward,
         "points_left_alone": int(unmoved.sum()),
         "points_not_finite": int((~cloud.finite).sum()),
         "points_coincident": int(cloud.finite.sum()) - len(cloud.start),
@@ -111,7 +122,7 @@ def iterate(points: Points, model: Model | None, config: DenoiseConfig) -> Itera
 class _Cloud:
     """The distinct finite points of an input in spatial order around their own origin, and the way back to its rows."""
 
-    def __init__(self, points: Points, config: DenoiseConfig) -> None:
+    def __init__(self, points: Points, config: DenoiseConfig, level: NoiseLevel | None = None) -> None:
         self.config, self.rows = config, points
         self.threads = config.threads or os.cpu_count() or 1
         self.finite: Mask = np.logical_and.reduce(np.isfinite(points), axis=1)
@@ -124,7 +135,7 @@ class _Cloud:
         back[order] = np.arange(len(order))
         self.start: Points = usable[first][order]
         self._row = back[place]
-        self.level: NoiseLevel = estimate(self.start, config.seed, self.threads)
+        self.level: NoiseLevel = level or estimate(self.start, config.seed, self.threads)
         self.diagonal = float(np.linalg.norm(np.ptp(self.start, axis=0))) if len(self.start) else 0.0
 
     def to_rows(self, values: NDArray[Any], missing: Any) -> NDArray[Any]:

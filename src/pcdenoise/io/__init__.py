@@ -6,15 +6,18 @@ What was read is written back as it was but for the coordinates that moved: `Sca
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, BinaryIO
 
+import numpy as np
+
 from pcdenoise.cloud.scan import Mask, Scan
 from pcdenoise.errors import ScanError
 from pcdenoise.io import files, kitti, las, pcd, ply, xyz
+from pcdenoise.io.crs import Crs
 from pcdenoise.io.source import changed, portable
 
 SUFFIXES = {
@@ -108,6 +111,45 @@ def select(scan: Scan, keep: Mask) -> Scan:
     source = scan.source.selected(keep)
     new = {name: values[keep] for name, values in changed(scan).items()}
     return replace(scan, points=scan.points[keep], attributes={**source.columns, **new}, source=source)
+
+
+def coordinate_system(scan: Scan) -> Crs | None:
+    """The coordinate reference system that the scan's file names, None if it names none; only LAS and LAZ do."""
+    return scan.source.crs() if isinstance(scan.source, las.LasSource) else None
+
+
+def coordinate_step(scan: Scan) -> float | None:
+    """The step between coordinates that the file can hold: the scale of a LAS, the decimals of a text; None if there is none.
+
+    Apart from LAS it is told from up to 10 000 rows: the largest power of ten, 1 to 1e-8, that all coordinates are multiples of.
+    """
+    if isinstance(scan.source, las.LasSource):
+        return float(np.abs(scan.source.file.field("scale")).max())
+    some = scan.points[scan.finite][:: max(1, len(scan) // 10_000)]
+    for decimals in range(9) if len(some) else ():
+        scaled = some * 10.0**decimals
+        if (np.abs(scaled - np.rint(scaled)) <= 1e-6 + 8 * np.finfo(np.float64).eps * np.abs(scaled)).all():
+            return float(10.0**-decimals)
+    return None
+
+
+def without(scan: Scan, names: Collection[str]) -> Scan:
+    """The scan without these columns, and its file without them and without our provenance: as before they were added.
+
+    LAS gets back the software, bounds and earlier provenance that writing ours replaced. A text file loses the columns' names
+    too. Raises ScanError if there is no such column.
+    """
+    for name in names:
+        if name not in scan.attributes:
+            raise ScanError(f"{scan.origin}: there is no column {name} to take away; it has {', '.join(scan.attributes)}")
+    left = {name: values for name, values in scan.attributes.items() if name not in names}
+    added = tuple(name for name in scan.added if name not in names)
+    if scan.source is None:
+        return replace(scan, attributes=left, added=added)
+    source = scan.source.without([name for name in names if name in scan.source.columns])
+    new = changed(scan)
+    columns = {name: left[name] if name in new else source.columns.get(name, left[name]) for name in left}
+    return replace(scan, attributes=columns, added=added, source=source)
 
 
 def _encode(scan: Scan, file: BinaryIO, format: str, suffix: str, provenance: Mapping[str, Any] | None) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import BinaryIO
 
@@ -31,6 +31,14 @@ class KittiSource:
     def attachments(self) -> list[str]:
         """Nothing."""
         return []
+
+    def payloads(self) -> dict[str, bytes]:
+        """Nothing."""
+        return {}
+
+    def without(self, names: Collection[str]) -> KittiSource:
+        """The file as it is: it has no further columns."""
+        return self
 
     def selected(self, keep: Mask) -> KittiSource:
         """The file with only these points."""

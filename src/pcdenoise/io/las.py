@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -13,25 +13,31 @@ from numpy.typing import NDArray
 from pcdenoise import __version__
 from pcdenoise.cloud.scan import Mask, Points, Scan
 from pcdenoise.errors import ScanError
-from pcdenoise.io import las_file
-from pcdenoise.io.las_dimensions import EXTRA_BYTES, Dimension, extended, structured
+from pcdenoise.io import crs, las_file
+from pcdenoise.io.crs import Crs
+from pcdenoise.io.las_dimensions import EXTRA_BYTES, Dimension, extended, reduced, structured
 from pcdenoise.io.las_file import HEADER, LasFile
 from pcdenoise.io.source import Column, changed, colours_as_words, portable, step_decimals, storable
 
 _PROVENANCE = (b"pcdenoise", 1)
 _CRS_IS_WKT = 16
+_BEFORE = "header_before"
+"""Key of the provenance under which a file's software, bounds and earlier provenance are kept, so that they can come back."""
+_LONGEST_NOTE = 1 << 14
+_VLR_HEAD, _EVLR_HEAD = 54, 60
 _INT32 = np.iinfo(np.int32)
 _QUANTA = 1e-8
 
 
 @dataclass(frozen=True)
 class LasSource:
-    """A LAS file, its records seen through `dimensions`, and the columns they gave when read."""
+    """A LAS file, its records seen through `dimensions`, the columns they gave when read, header fields to write instead."""
 
     file: LasFile
     records: NDArray[Any]
     dimensions: Mapping[str, Dimension]
     columns: Mapping[str, Column]
+    header: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def of(cls, file: LasFile) -> LasSource:
@@ -56,6 +62,44 @@ class LasSource:
         if self.file.field("waveforms_start"):
             found.append("waveform packets")
         return list(dict.fromkeys(found))
+
+    def crs(self) -> Crs | None:
+        """The coordinate reference system that its records name."""
+        records = [*((record, _VLR_HEAD) for record in self.file.vlrs), *((record, _EVLR_HEAD) for record in self.file.evlrs())]
+        said = {
+            las_file.vlr_identity(record)[1]: record[head:]
+            for record, head in reversed(records)
+            if las_file.vlr_identity(record)[0] == b"LASF_Projection"
+        }
+        return crs.parse(said)
+
+    def payloads(self) -> dict[str, bytes]:
+        """The bytes of each VLR and EVLR that says nothing about the layout of points, and of the waveforms, by name."""
+        own = (EXTRA_BYTES, las_file.LASZIP, _PROVENANCE)
+        records = [(las_file.vlr_identity(record), "VLR", record) for record in self.file.vlrs]
+        records += [(las_file.vlr_identity(record), "EVLR", record) for record in self.file.evlrs()]
+        found: dict[str, bytes] = {}
+        for (user_id, record_id), kind, record in records:
+            if (user_id, record_id) not in own:
+                name = f"{kind} {user_id.decode('latin-1')}/{record_id}"
+                found[name] = found.get(name, b"") + record
+        if self.file.field("waveforms_start"):
+            found["waveform packets"] = self.file.tail
+        return found
+
+    def without(self, names: Collection[str]) -> LasSource:
+        """The file as it was before these extra bytes and our provenance were written: header fields noted there come back."""
+        notes = self.file.vlr(*_PROVENANCE)
+        file, header = reduced(self.file, names).without_vlr(*_PROVENANCE), {}
+        if notes:
+            try:
+                said = json.loads(notes[0])[_BEFORE]
+                header = {"software": said["software"].encode("latin-1"), "bounds": np.array(said["bounds"], np.float64)}
+                if earlier := said["provenance"]:
+                    file = file.with_vlr(*_PROVENANCE, b"how this file was made", earlier.encode("latin-1"))
+            except (ValueError, KeyError, TypeError, AttributeError):
+                header = {}
+        return replace(LasSource.of(file), header=header)
 
     def selected(self, keep: Mask) -> LasSource:
         """The file with only these rows; counts and bounds follow."""
@@ -106,9 +150,23 @@ def write(scan: Scan, file: BinaryIO, *, compressed: bool, provenance: Mapping[s
     if own is None:
         target = _counted(target)
     if provenance is not None:
-        target = target.with_vlr(*_PROVENANCE, b"how this file was made", json.dumps(provenance).encode())
+        note = json.dumps({**provenance, **_header_before(own)}).encode()
+        target = target.with_vlr(*_PROVENANCE, b"how this file was made", note)
         target = target.with_header(software=f"pcdenoise {__version__}".encode())
+    elif own is not None and own.header:
+        target = target.with_header(**own.header)
     target.write(file, compressed=compressed)
+
+
+def _header_before(source: LasSource | None) -> dict[str, Any]:
+    """What writing our provenance replaces in a file's header and VLRs, in a form that JSON holds exactly."""
+    if source is None:
+        return {}
+    software, bounds = source.file.field("software"), source.file.field("bounds")
+    earlier = (source.file.vlr(*_PROVENANCE) or [b""])[0].decode("latin-1")
+    if not np.isfinite(bounds).all() or len(earlier) > _LONGEST_NOTE:
+        return {}
+    return {_BEFORE: {"software": software.decode("latin-1"), "bounds": bounds.tolist(), "provenance": earlier}}
 
 
 def _by_dimension(columns: Mapping[str, Column], source: LasSource) -> dict[str, Column]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -123,6 +123,22 @@ def extended(file: LasFile, columns: Mapping[str, Column]) -> LasFile:
         little = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
         blocks.append(little.view(np.uint8).reshape(len(values), little.itemsize))
     return replace(file, records=np.concatenate(blocks, axis=1)).with_vlr(*EXTRA_BYTES, b"extra bytes", data)
+
+
+def reduced(file: LasFile, names: Collection[str]) -> LasFile:
+    """The file without the extra bytes described under these names: what `extended` added goes, byte for byte."""
+    entries = _entries(file)
+    widths = [dtype.itemsize * n_elements for dtype, n_elements in map(_number_type, entries)]
+    ends = standard_length(file.point_format) + np.cumsum(widths, dtype=np.int64)
+    dropped = [entry["name"].decode("utf-8", "replace") in names for entry in entries]
+    if not any(dropped) or ends[-1] > file.records.shape[1]:
+        return file
+    kept = np.ones(file.records.shape[1], dtype=np.bool_)
+    for end, width, is_dropped in zip(ends.tolist(), widths, dropped, strict=True):
+        kept[end - width : end] = not is_dropped
+    left = entries[~np.array(dropped)].tobytes()
+    slim = replace(file, records=np.ascontiguousarray(file.records[:, kept]))
+    return slim.with_vlr(*EXTRA_BYTES, b"extra bytes", left) if left else slim.without_vlr(*EXTRA_BYTES)
 
 
 def _entries(file: LasFile) -> NDArray[Any]:

@@ -83,8 +83,16 @@ class LasFile:
         identities = [vlr_identity(record) for record in self.vlrs]
         place = identities.index((user_id, record_id)) if (user_id, record_id) in identities else len(self.vlrs)
         vlrs = [record for i, record in enumerate(self.vlrs) if i < place or identities[i] != (user_id, record_id)]
-        vlrs.insert(place, _VLR.pack(0, user_id, record_id, len(data), description) + data)
+        reserved = 0
+        if place < len(self.vlrs):
+            reserved, _, _, _, description = _VLR.unpack_from(self.vlrs[place])
+        vlrs.insert(place, _VLR.pack(reserved, user_id, record_id, len(data), description) + data)
         return replace(self, vlrs=tuple(vlrs)).with_header(n_vlrs=len(vlrs))
+
+    def without_vlr(self, user_id: bytes, record_id: int) -> LasFile:
+        """The file without the VLRs of this identity."""
+        vlrs = tuple(record for record in self.vlrs if vlr_identity(record) != (user_id, record_id))
+        return replace(self, vlrs=vlrs).with_header(n_vlrs=int(self.field("n_vlrs")) + len(vlrs) - len(self.vlrs))
 
     def without_copc(self) -> LasFile:
         """The file as plain LAZ: the COPC octree indexes the old coordinates, so its VLR and EVLRs go."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import struct
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
@@ -54,6 +54,23 @@ class PcdSource:
         found = [f"organisation in {self.header.height} rows"] if self.header.height > 1 else []
         placed = all(is_number(word.encode()) for word in self.header.viewpoint) and len(self.header.viewpoint) == len(_IDENTITY)
         return found + (["viewpoint"] if placed and tuple(map(float, self.header.viewpoint)) != _IDENTITY else [])
+
+    def payloads(self) -> dict[str, bytes]:
+        """The viewpoint and the grid, as the header says them."""
+        grid = f"{self.header.n_points // self.header.height} x {self.header.height}".encode()
+        named = {"viewpoint": " ".join(self.header.viewpoint).encode(), f"organisation in {self.header.height} rows": grid}
+        return {name: named[name] for name in self.attachments()}
+
+    def without(self, names: Collection[str]) -> PcdSource:
+        """The file without these fields and our comment; a field of several values goes if all its columns do."""
+        gone = {self.labels[name] for name in names if name in self.labels}
+        indices = [i for i, field in enumerate(self.header.fields) if field.count and gone.issuperset(field.labels(i))]
+        header = self.header.without(indices)
+        data = self.records.without([label for i in indices for label in self.header.fields[i].labels(i)])
+        if self.header.encoding == "binary_compressed":
+            data = _compressed(data, pcd_header.parse(header, self.origin))
+        source: PcdSource = read(header + self.before + data + self.after, self.origin).source
+        return source
 
     def selected(self, keep: Mask) -> PcdSource:
         """The file with only these points, no longer organised: WIDTH is their number, HEIGHT 1."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,6 +58,16 @@ class Header:
                 b"TYPE": [letters[dtype.kind] for dtype in types], b"COUNT": ["1"] * len(types),
             }
         )  # fmt: skip
+
+    def without(self, indices: Collection[int]) -> bytes:
+        """The header's bytes without the fields of these numbers and without our provenance."""
+        lines = [line for line in self.raw.splitlines(keepends=True) if not line.startswith(_PROVENANCE)]
+        for i, line in enumerate(lines):
+            if line.split() and line.split()[0].upper() in (b"FIELDS", b"COLUMNS", b"SIZE", b"TYPE", b"COUNT"):
+                words = re.findall(rb"\s*\S+", line.rstrip())
+                left = words[:1] + [word for k, word in enumerate(words[1:]) if k not in indices]
+                lines[i] = b"".join(left) + line[len(line.rstrip()) :]
+        return b"".join(lines)
 
     def with_count(self, n_points: int) -> bytes:
         """The header's bytes for another number of points, not organised."""

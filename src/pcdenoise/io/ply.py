@@ -6,7 +6,7 @@ Bodies are read without plyfile, which takes seconds for a million rows of text 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
@@ -44,6 +44,16 @@ class PlySource:
         """Faces and other elements, and lists of the vertices."""
         found = [f"{element.count} {element.name} elements" for element in self._others()]
         return found + [f"list property {prop.name}" for prop in self.header.vertex.properties if prop.length is not None]
+
+    def payloads(self) -> dict[str, bytes]:
+        """The bytes of the elements before and after the vertices."""
+        return {"other elements": self.before + self.after} if self._others() else {}
+
+    def without(self, names: Collection[str]) -> PlySource:
+        """The file without these properties and our comment."""
+        raw = self.header.without(names) + self.before + self.records.without(names) + self.after
+        source: PlySource = read(raw, self.origin).source
+        return source
 
     def selected(self, keep: Mask) -> PlySource:
         """The file with only these vertices. Raises ScanError if it has other elements, which name vertices by row."""

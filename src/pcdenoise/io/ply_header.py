@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from typing import Any, Literal
@@ -73,6 +73,17 @@ class Header:
                 last = i
         new = [f"property {TYPES[dtype.str[1:]]} {name}".encode() + eol for name, dtype in types.items()]
         return b"".join([*lines[: last + 1], *new, *lines[last + 1 :]])
+
+    def without(self, names: Collection[str]) -> bytes:
+        """The header's bytes without these single properties of the vertices and without our provenance."""
+        lines = [line for line in self.raw.splitlines(keepends=True) if not line.startswith(_PROVENANCE)]
+        kept, element = [], b""
+        for line in lines:
+            words = line.split()
+            element = words[1] if words[:1] == [b"element"] else element
+            named = element == b"vertex" and words[:1] == [b"property"] and len(words) == 3 and words[2].decode() in names
+            kept += [] if named else [line]
+        return b"".join(kept)
 
     def with_count(self, count: int) -> bytes:
         """The header's bytes for another number of vertices."""

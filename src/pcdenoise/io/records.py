@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
 from pcdenoise.cloud.scan import Mask, Points
@@ -32,6 +33,9 @@ class Records(Protocol):
 
     def selected(self, keep: Mask) -> bytes:
         """The bytes of the records kept."""
+
+    def without(self, names: Collection[str]) -> bytes:
+        """The bytes of the records without these fields."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,10 @@ class FixedRecords:
 
     def selected(self, keep: Mask) -> bytes:
         return self.array[keep].tobytes()
+
+    def without(self, names: Collection[str]) -> bytes:
+        left = [name for name in self.array.dtype.names or () if name not in names]
+        return repack_fields(self.array[left]).tobytes()
 
 
 @dataclass(frozen=True)
@@ -95,6 +103,11 @@ class ListRecords:
         starts = np.concatenate([np.zeros(1, np.int64), self.ends])[: len(self.ends)]
         return without(self.body, starts[~keep], (self.ends - starts)[~keep]).tobytes()
 
+    def without(self, names: Collection[str]) -> bytes:
+        starts = np.concatenate([np.zeros(0, np.int64), *(self.offsets[name] for name in names)])
+        sizes = np.repeat([self.dtypes[name].itemsize for name in names], len(self.ends))
+        return without(self.body, starts, sizes.astype(np.int64)).tobytes()
+
 
 @dataclass(frozen=True)
 class TextRecords:
@@ -128,6 +141,9 @@ class TextRecords:
 
     def selected(self, keep: Mask) -> bytes:
         return self.rows.selected(keep).body.tobytes()
+
+    def without(self, names: Collection[str]) -> bytes:
+        return self.rows.without([self.fields[name][0] for name in names]).tobytes()
 
 
 def encoded(values: Column, dtype: np.dtype[Any], name: str) -> Column:

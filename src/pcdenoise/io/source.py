@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -36,6 +36,12 @@ class Source(Protocol):
 
     def attachments(self) -> list[str]:
         """What the file holds beside points and columns, in words, for whoever writes another format."""
+
+    def payloads(self) -> dict[str, bytes]:
+        """The bytes of what the file holds beside points and columns, by name, without what only says how these are stored."""
+
+    def without(self, names: Collection[str]) -> Source:
+        """The file without the columns of these names and without our provenance: the inverse of adding them."""
 
     def selected(self, keep: Mask) -> Source:
         """The file with only these rows. Raises ScanError if other parts of it refer to rows."""

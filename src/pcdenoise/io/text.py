@@ -142,6 +142,13 @@ class TextRows:
         shift = (np.cumsum(removed) - removed)[keep]
         return replace(self, body=body, starts=self.starts[keep] - shift, ends=self.ends[keep] - shift)
 
+    def without(self, columns: Sequence[ColumnIndex]) -> Octets:
+        """The body without fields that are not the first of their row, each with the one byte before it, as `rewritten` adds."""
+        spans = [_Fields.of(self, *block).spans(column) for block in self._blocks() for column in columns]
+        starts = np.concatenate([np.zeros(0, np.int64), *(starts - 1 for starts, _ in spans)])
+        ends = np.concatenate([np.zeros(0, np.int64), *(ends for _, ends in spans)])
+        return without(self.body, starts, ends - starts)
+
     def fault(self, row: int, what: str) -> ScanError:
         """An error that names the line of a row."""
         before = self.body[: self.starts[row]]
@@ -257,13 +264,26 @@ def _printed(values: NDArray[Any], form: str) -> tuple[Octets, Offsets]:
 
 
 def coordinates(rows: TextRows, column: ColumnIndex, before: Points, after: Column, moved: Mask) -> NewFields:
-    """New fields for one coordinate of the rows that moved: the column's decimals, but a step of at most 1e-6 of the extent."""
+    """New fields for one coordinate of the rows that moved: the column's decimals, but a step of at most 1e-6 of the extent.
+
+    Values that are short decimals themselves, as those a file gave before they moved, are printed exactly.
+    """
+    if (short := _fewest_decimals(after[moved])) is not None:
+        return NewFields(after, f"%.{short}f", column, moved)
     needed = step_decimals(before, _COORDINATE_STEP)
     digits, exponent = rows.decimals(column)
     if exponent:
         size = float(np.abs(before[np.isfinite(before)]).max(initial=1.0))
         return NewFields(after, f"%.{min(max(digits, needed + int(np.ceil(np.log10(size)))), 17)}e", column, moved)
     return NewFields(after, f"%.{min(max(digits, needed), 17)}f", column, moved)
+
+
+def _fewest_decimals(values: Column) -> int | None:
+    """The fewest decimals, up to 12, that all values have; None if some have more."""
+    for decimals in range(13):
+        if all(bool((np.round(some, decimals) == some).all()) for some in (values[:64], values)):
+            return decimals
+    return None
 
 
 def plain(values: Column, column: ColumnIndex | None = None) -> NewFields:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import BinaryIO
 
@@ -51,6 +51,24 @@ class XyzSource:
     def attachments(self) -> list[str]:
         """Nothing: a text file is its columns."""
         return []
+
+    def payloads(self) -> dict[str, bytes]:
+        """Nothing."""
+        return {}
+
+    def without(self, names: Collection[str]) -> XyzSource:
+        """The file without these columns, in its rows and in the line that names the columns."""
+        head = self.head
+        if self.names_end is not None:
+            joint = b" " if self.rows.delimiter is None else bytes([self.rows.delimiter])
+            start = head.rfind(b"\n", 0, self.names_end) + 1
+            line = head[start : self.names_end]
+            for name in names:
+                line = line.replace(joint + name.encode(), b"", 1)
+            head = head[:start] + line + head[self.names_end :]
+        body = self.rows.without([self.indices[name] for name in names])
+        source: XyzSource = read(head + body.tobytes(), self.rows.origin).source
+        return source
 
     def selected(self, keep: Mask) -> XyzSource:
         """The file with only these lines, its count line corrected. Raises ScanError if none is left."""
