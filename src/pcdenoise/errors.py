@@ -10,6 +10,9 @@
 A message is one line that names the file (or setting), the fault and the fix.
 """
 
+_OUT_OF_MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "can't start new thread")
+"""How torch and the threading module say it, in a RuntimeError."""
+
 
 class PcdenoiseError(Exception):
     """Root of all expected errors."""
@@ -45,6 +48,17 @@ class BatchError(PcdenoiseError):
     """Some inputs of a batch failed; the others are done."""
 
     exit_code = 1
+
+
+def of_the_system(fault: Exception) -> ScanError | None:
+    """What the user is told when the disk, the memory or a permission failed; None if the fault is none of these but a bug."""
+    said = in_one_line(fault)
+    if isinstance(fault, MemoryError) or any(words in said for words in _OUT_OF_MEMORY):
+        return ScanError("out of memory; free some, split the scan into tiles, or use fewer --threads")
+    if isinstance(fault, OSError) and not isinstance(fault, BrokenPipeError):
+        where = f"{fault.filename}: " if fault.filename is not None else ""
+        return ScanError(f"{where}{fault.strerror or said}; check the path, its permissions and free space")
+    return None
 
 
 def in_one_line(fault: BaseException) -> str:

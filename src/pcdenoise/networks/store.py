@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from importlib import resources
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pcdenoise.errors import ModelError, in_one_line
+from pcdenoise.whole_files import replaced
 
 if TYPE_CHECKING:
     from pcdenoise.networks.projection import ProjectionNetwork
@@ -115,10 +115,9 @@ def load(name_or_folder: str | Path = DEFAULT) -> Model:
 def save(
     network: ProjectionNetwork, folder: Path, *, summary: str, training: Mapping[str, Any], scores: Mapping[str, Any], card: str
 ) -> None:
-    """Writes a model folder; every file appears whole or not at all."""
+    """Writes a model folder; every file appears whole or not at all. Raises ModelError if one cannot be written."""
     from safetensors.torch import save as serialise
 
-    folder.mkdir(parents=True, exist_ok=True)
     config = ModelConfig(
         network="projection",
         settings=_Settings(**asdict(network.config)),
@@ -131,10 +130,13 @@ def save(
         CONFIG: (config.model_dump_json(indent=1) + "\n").encode(),
         CARD: card.encode(),
     }
-    for name, data in files.items():
-        part = folder / f".{name}.part"
-        part.write_bytes(data)
-        os.replace(part, folder / name)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, data in files.items():
+            with replaced(folder / name) as file:
+                file.write(data)
+    except OSError as fault:
+        raise ModelError(f"{folder}: cannot be saved ({fault.strerror}); check permissions and free space") from None
 
 
 def _find(name_or_folder: str | Path) -> Path:
