@@ -10,8 +10,14 @@
 A message is one line that names the file (or setting), the fault and the fix.
 """
 
-_OUT_OF_MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "can't start new thread")
-"""How torch and the threading module say it, in a RuntimeError."""
+_OUT_OF_MEMORY = (
+    "can't allocate memory",
+    "not enough memory",
+    "out of memory",
+    "can't start new thread",
+    "failed to map segment",
+)
+"""How torch, the threading module and the loader of libraries say it, in a RuntimeError or ImportError."""
 
 
 class PcdenoiseError(Exception):
@@ -50,14 +56,16 @@ class BatchError(PcdenoiseError):
     exit_code = 1
 
 
-def of_the_system(fault: Exception) -> ScanError | None:
-    """What the user is told when the disk, the memory or a permission failed; None if the fault is none of these but a bug."""
+def of_the_system(fault: Exception, place: str = "") -> ScanError | None:
+    """What the user is told when disk, memory or a permission failed while at a place (a file); None if the fault is a bug."""
     said = in_one_line(fault)
     if isinstance(fault, MemoryError) or any(words in said for words in _OUT_OF_MEMORY):
-        return ScanError("out of memory; free some, split the scan into tiles, or use fewer --threads")
+        return ScanError(
+            f"{place}{': ' * bool(place)}out of memory; free some, split the scan into tiles, or use fewer --threads"
+        )
     if isinstance(fault, OSError) and not isinstance(fault, BrokenPipeError):
-        where = f"{fault.filename}: " if fault.filename is not None else ""
-        return ScanError(f"{where}{fault.strerror or said}; check the path, its permissions and free space")
+        where = place if fault.filename is None else fault.filename
+        return ScanError(f"{where or 'stdout'}: {fault.strerror or said}; check the path, its permissions and free space")
     return None
 
 

@@ -28,7 +28,7 @@ class Batch:
             try:
                 self.records.append({**names, "status": "done", "figures": work(job)})
             except Exception as fault:
-                error = fault if isinstance(fault, PcdenoiseError) else of_the_system(fault)
+                error = fault if isinstance(fault, PcdenoiseError) else of_the_system(fault, str(job.source))
                 if error is None:
                     raise
                 self._errors.append(error)
