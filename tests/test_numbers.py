@@ -45,10 +45,20 @@ CLOUDS: dict[str, Callable[[np.random.Generator], np.ndarray]] = {
     "extent of ten thousand kilometres": lambda rng: 1e7 * plane(400, rng),
     "UTM": lambda rng: plane(400, rng) + UTM,
     "degrees": lambda rng: plane(400, rng) * [1e-5, 1e-5, 1] + [13.4, 52.5, 34],
-    "denormal": lambda rng: 1e-310 * plane(400, rng),
-    "astronomical": lambda rng: 1e100 * plane(400, rng),
-    "beyond squares": lambda rng: 1e200 * plane(400, rng),
 }
+
+
+@pytest.mark.parametrize("scale", [1e-310, 1e-100, 1e100, 1e200, 1e307])
+def test_coordinates_whose_squares_are_lost_are_refused_in_one_line(
+    scale: float, tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, out = tmp_path / "scan.ply", tmp_path / "out.ply"
+    pcdenoise.write(Scan(scale * plane(100, rng)), path)
+    for arguments in (["info", str(path)], ["denoise", str(path), "-o", str(out), "--method", "mean"]):
+        assert main(arguments) == 3
+        assert "beyond any scan" in (said := capsys.readouterr().err)
+        assert said.count("\n") == 1
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("method", METHODS)
