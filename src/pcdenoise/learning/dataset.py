@@ -192,7 +192,9 @@ def _surfaces(text: str, seed: int, cache: Path) -> Surfaces:
         raise ScanError(f"{text}: no such file or folder; check --data, or give shapes:400 for procedural surfaces")
     meshes = [file for file in (sorted(path.rglob("*")) if path.is_dir() else [path]) if _is_mesh(file)]
     if not meshes:
-        raise UsageError(f"{text}: no mesh to learn from; give a folder of meshes, shapes:400, or a folder made by pcdenoise synth")
+        raise UsageError(
+            f"{text}: no mesh to learn from; give a folder of meshes, shapes:400, or a folder made by pcdenoise synth"
+        )
     return [partial(_cached, cache / f"{n}.npy", partial(_from_mesh, file)) for n, file in enumerate(meshes)]
 
 

@@ -90,9 +90,7 @@ def _initial(config: TrainConfig, init: str | None) -> ProjectionNetwork:
         network = ProjectionNetwork(replace(learned.config, neighbours=config.neighbours))
         network.load_state_dict(learned.state_dict())
         return network
-    return ProjectionNetwork(
-        ProjectionConfig(config.channels, config.neighbours, config.rounds, config.landing_rounds)
-    )
+    return ProjectionNetwork(ProjectionConfig(config.channels, config.neighbours, config.rounds, config.landing_rounds))
 
 
 class _Run:

@@ -26,7 +26,13 @@ class Pooled(NamedTuple):
 
 
 def exchange(
-    features: Tensor, own: Tensor, heard: Tensor, source: Tensor, weight: Tensor, first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]
+    features: Tensor,
+    own: Tensor,
+    heard: Tensor,
+    source: Tensor,
+    weight: Tensor,
+    first: tuple[Tensor, Tensor],
+    second: tuple[Tensor, Tensor],
 ) -> Pooled:
     """relu(W₂ relu(W₁ e + own + heard) + b₂) for every edge, pooled over the edges of a point.
 
@@ -66,7 +72,9 @@ class _Exchange(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, of_message: Tensor | None, of_mean: Tensor | None, of_most: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(
+        ctx: Any, of_message: Tensor | None, of_mean: Tensor | None, of_most: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
         features, source, weight, share, weight1, weight2, hidden, message, most = ctx.saved_tensors
         (m, k, f), c = features.shape, most.shape[1]
         of_weight1, of_weight2 = torch.zeros_like(weight1), torch.zeros_like(weight2)
