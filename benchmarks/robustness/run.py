@@ -140,36 +140,38 @@ def _forked(arguments: list[str], stdout: Any, stderr: Any, file_size: int) -> i
 
 
 def through_all_commands(path: Path, folder: Path, tally: Tally) -> None:
-    """info, denoise with the network, verify; in bounded time and memory, refused by all or by none."""
+    """info, denoise with the network, verify; in bounded time and memory, refused by all or by none.
+
+    This process reads nothing itself: the threads that lazrs would start in it do not survive the forks.
+    """
     tally.counts["files"] += 1
-    try:
-        n_points, form = len(io.read(path)), io.SUFFIXES[path.suffix.lower()]
-    except ScanError:
-        n_points, form = 0, "refused"
-    tally.formats[form] += 1
-    limit_s = TIME_LIMIT_S + TIME_PER_MILLION_POINTS_S * n_points / 1e6
-    most = MEMORY_FLOOR + MEMORY_PER_BYTE * path.stat().st_size + MEMORY_PER_POINT * n_points
     target = folder / path.name.replace(".copc", "")
+    threads = ["--threads", "1"]
     steps = {
-        "info": ["info", str(path), "--json"],
-        "denoise": ["denoise", str(path), "-o", str(target), "--overwrite", "-q"],
+        "info": ["info", str(path), "--json", *threads],
+        "denoise": ["denoise", str(path), "-o", str(target), "--overwrite", "-q", *threads],
         "verify": ["verify", str(path), str(target)],
     }
+    n_points, is_refused = 0, False
     for name, arguments in steps.items():
-        done = run(arguments, 6 * limit_s)  # wall time on a machine that does other things too; CPU time is what is judged
+        done = run(arguments, 300)  # wall time, for what waits; CPU time is what is judged
         title = f"{name} {path.name}"
         tally.judge(title, done, EXPECTED_CODES)
+        if name == "info":
+            is_refused = done.code == 3
+            n_points = 0 if done.code else json.loads(done.stdout)[0]["points"]
+            tally.formats["refused" if is_refused else io.SUFFIXES[path.suffix.lower()]] += 1
+        limit_s = TIME_LIMIT_S + TIME_PER_MILLION_POINTS_S * n_points / 1e6
+        most = MEMORY_FLOOR + MEMORY_PER_BYTE * path.stat().st_size + MEMORY_PER_POINT * n_points
         tally.check(title, done.seconds <= limit_s, f"took {done.seconds:.1f} CPU s")
         tally.check(title, done.peak <= most, f"took {done.peak / 2**20:.0f} MB")
-        if form == "refused":
+        if is_refused:
+            tally.refused[path.name] = done.stderr.strip()
             tally.check(title, done.code == 3 and not target.exists(), "was not refused")
-            tally.refused[path.name] = done.stderr.strip() or tally.refused.get(path.name, "")
             if name == "denoise":
                 break
         else:
             tally.check(title, done.code == 0, f"readable, but {done.stderr[-200:]}")
-        if name == "info" and done.code == 0:
-            tally.check(title, json.loads(done.stdout)[0]["points"] == n_points, "another number of points")
     target.unlink(missing_ok=True)
     tally.check(path.name, not list(folder.iterdir()), "something is left beside the output")
 
