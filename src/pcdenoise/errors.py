@@ -10,6 +10,15 @@
 A message is one line that names the file (or setting), the fault and the fix.
 """
 
+_OUT_OF_MEMORY = (
+    "can't allocate memory",
+    "not enough memory",
+    "out of memory",
+    "can't start new thread",
+    "failed to map segment",
+)
+"""How torch, the threading module and the loader of libraries say it, in a RuntimeError or ImportError."""
+
 
 class PcdenoiseError(Exception):
     """Root of all expected errors."""
@@ -45,6 +54,19 @@ class BatchError(PcdenoiseError):
     """Some inputs of a batch failed; the others are done."""
 
     exit_code = 1
+
+
+def of_the_system(fault: Exception, place: str = "") -> ScanError | None:
+    """What the user is told when disk, memory or a permission failed while at a place (a file); None if the fault is a bug."""
+    said = in_one_line(fault)
+    if isinstance(fault, MemoryError) or any(words in said for words in _OUT_OF_MEMORY):
+        return ScanError(
+            f"{place}{': ' * bool(place)}out of memory; free some, split the scan into tiles, or use fewer --threads"
+        )
+    if isinstance(fault, OSError) and not isinstance(fault, BrokenPipeError):
+        where = place if fault.filename is None else fault.filename
+        return ScanError(f"{where or 'stdout'}: {fault.strerror or said}; check the path, its permissions and free space")
+    return None
 
 
 def in_one_line(fault: BaseException) -> str:

@@ -15,6 +15,7 @@ Points = NDArray[np.float64]
 """(N, 3) world coordinates."""
 Mask = NDArray[np.bool_]
 """(N,) per-point truth values."""
+_EXTENTS = (1e-15, 1e15)
 
 
 @dataclass(frozen=True)
@@ -62,3 +63,13 @@ class Scan:
         """The scan with new per-point columns, written as LAS extra bytes, PLY properties, text columns or PCD fields."""
         added = self.added + tuple(name for name in values if name not in self.added)
         return replace(self, attributes={**self.attributes, **values}, added=added)
+
+
+def check_extent(points: Points) -> None:
+    """Raises ScanError if the largest extent of (N, 3) finite points is so large or small that squares of lengths are lost."""
+    with np.errstate(over="ignore"):
+        extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    if extent and not _EXTENTS[0] <= extent <= _EXTENTS[1]:
+        raise ScanError(
+            f"coordinates span {extent:.3g}, beyond any scan; rescale them or remove the rows that are no measurements"
+        )

@@ -5,9 +5,12 @@ Command modules import the rest of pcdenoise inside their functions, so that --h
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from io import TextIOWrapper
 from types import FrameType
 from typing import Annotated, Any, NoReturn
 
@@ -30,13 +33,14 @@ from pcdenoise.commands import (
     undo,
     verify,
 )
-from pcdenoise.errors import PcdenoiseError, ScanError
+from pcdenoise.errors import PcdenoiseError, of_the_system
 
 EXIT_CODES = """\
 Exit codes: 0 done · 1 some inputs of a batch failed · 2 usage · 3 unreadable or unwritable file · 4 model does not fit ·
-5 a quality gate failed · 130 interrupted, nothing half-written."""
+5 a quality gate failed · 130 interrupted, nothing half-written · 141 the reader of stdout left · 143 terminated."""
 
 INTERRUPTED = 130
+READER_GONE = 141
 
 app = typer.Typer(name="pcdenoise", no_args_is_help=True, pretty_exceptions_enable=False, epilog=EXIT_CODES)
 
@@ -79,22 +83,68 @@ def _pcdenoise(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line and returns its exit code. Expected errors become one line on stderr; bugs keep their traceback."""
-    previous = signal.signal(signal.SIGTERM, _terminate)
+    _replace_closed_streams()
+    with _polite_kills():
+        try:
+            code = app(args=arguments, prog_name="pcdenoise", standalone_mode=False)
+            sys.stdout.flush()
+            return _fail("interrupted; nothing is half-written", INTERRUPTED) if code == INTERRUPTED else int(code or 0)
+        except PcdenoiseError as error:
+            return _fail(str(error), error.exit_code)
+        except typer.TyperException as error:
+            return _fail(_usage(error), error.exit_code)
+        except BrokenPipeError:
+            return _without_reader()
+        except SystemExit as stop:
+            if isinstance(stop.__context__, BrokenPipeError):  # Typer makes it exit code 1
+                return _without_reader()
+            raise
+        except Exception as fault:
+            known = of_the_system(fault)
+            if known is None:
+                raise
+            if isinstance(fault, OSError) and fault.filename is None:
+                _drop_stdout()
+            return _fail(str(known), known.exit_code)
+
+
+@contextmanager
+def _polite_kills() -> Iterator[None]:
+    """SIGTERM and a closed terminal unwind like Ctrl-C, so that temporary files are removed; what was ignored stays so."""
+    numbers = [signal.SIGTERM, *([signal.SIGHUP] if sys.platform != "win32" else [])]
+    previous = {number: signal.getsignal(number) for number in numbers if signal.getsignal(number) != signal.SIG_IGN}
+    for number in previous:
+        signal.signal(number, _terminate)
     try:
-        code = app(args=arguments, prog_name="pcdenoise", standalone_mode=False)
-        sys.stdout.flush()
-        return _fail("interrupted; nothing is half-written", INTERRUPTED) if code == INTERRUPTED else int(code or 0)
-    except PcdenoiseError as error:
-        return _fail(str(error), error.exit_code)
-    except typer.TyperException as error:
-        return _fail(_usage(error), error.exit_code)
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        return _fail(f"{where}{error.strerror or error}", ScanError.exit_code)
-    except MemoryError:
-        return _fail("out of memory; free some, or split the scan into tiles", ScanError.exit_code)
+        yield
     finally:
-        signal.signal(signal.SIGTERM, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _replace_closed_streams() -> None:
+    """`>&-` leaves no stream, and the first file opened would get its number: reading finds nothing, writing to stdout fails."""
+    if sys.stdin is None:
+        sys.stdin = open(os.devnull)  # noqa: SIM115
+    if sys.stdout is None:
+        sys.stdout = os.fdopen(os.open(os.devnull, os.O_RDONLY), "w")
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper) and stream.errors == "strict":  # names of files may be beyond the terminal's letters
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _without_reader() -> int:
+    """The reader of stdout has what it wanted (`| head`): no word about it, and the exit code that a shell gives for SIGPIPE."""
+    _drop_stdout()
+    return READER_GONE
+
+
+def _drop_stdout() -> None:
+    """What stdout still holds goes nowhere, so that Python's own last flush does not complain."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _fail(message: str, code: int) -> int:
@@ -113,6 +163,7 @@ def _usage(error: typer.TyperException) -> str:
 
 
 def _terminate(number: int, frame: FrameType | None) -> NoReturn:
-    """A polite kill unwinds like Ctrl-C, so that temporary files are removed."""
+    """Unwinds once; a second signal of the kind does not disturb the tidying up."""
     del frame
+    signal.signal(number, signal.SIG_IGN)
     sys.exit(128 + number)

@@ -7,7 +7,7 @@ from typing import Any
 
 from pcdenoise.commands.console import Console
 from pcdenoise.commands.files import Job
-from pcdenoise.errors import BatchError, PcdenoiseError
+from pcdenoise.errors import BatchError, PcdenoiseError, of_the_system
 
 Figures = dict[str, Any]
 """Numbers about one input, by name."""
@@ -22,12 +22,15 @@ class Batch:
         self._errors: list[PcdenoiseError] = []
 
     def run(self, jobs: Sequence[Job], work: Callable[[Job], Figures]) -> None:
-        """One record per job, in order. An expected error of one job becomes its record."""
+        """One record per job, in order. An expected error of one job, or the system's (disk, memory), becomes its record."""
         for job in jobs:
             names = {"input": str(job.source), "output": str(job.target)}
             try:
                 self.records.append({**names, "status": "done", "figures": work(job)})
-            except PcdenoiseError as error:
+            except Exception as fault:
+                error = fault if isinstance(fault, PcdenoiseError) else of_the_system(fault, str(job.source))
+                if error is None:
+                    raise
                 self._errors.append(error)
                 self.records.append({**names, "status": "failed", "error": str(error), "exit_code": error.exit_code})
                 if len(jobs) > 1:

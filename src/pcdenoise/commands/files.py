@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,18 +42,36 @@ def _expand_one(text: str) -> list[Path]:
     if text == "-" or path.is_file():
         return [path]
     if path.is_dir():
-        scans = sorted(entry for entry in path.iterdir() if entry.is_file() and io.is_scan(entry))
+        visible = (entry for entry in path.iterdir() if not entry.name.startswith("."))
+        scans = sorted(entry for entry in visible if entry.is_file() and io.is_scan(entry))
         if not scans:
             raise ScanError(f"{text}: the folder holds no scan; known suffixes are {' '.join(sorted(io.SUFFIXES))}")
         return scans
     if glob.has_magic(text):
-        matches = sorted(Path(match) for match in glob.glob(text, recursive=True) if Path(match).is_file())
+        matches = sorted(path for path in _matches(text) if path.is_file())
         if not matches:
             raise ScanError(f"{text}: the pattern matches no file; quote it and check the folder")
         return matches
     if path.exists():  # a named pipe or a device
         return [path]
     raise ScanError(f"{text}: no such file or folder; check the path")
+
+
+def _matches(pattern: str) -> Iterator[Path]:
+    """What a pattern names; `**` is any depth of visible folders, each entered once, however many links lead to it."""
+    pattern = pattern.replace(os.sep, "/") + ("/*" if pattern.endswith("**") else "")
+    before, anywhere, after = pattern.partition("**/")
+    if not anywhere or (before and not before.endswith("/")):
+        yield from map(Path, glob.iglob(pattern))
+        return
+    entered: set[str] = set()
+    for top in glob.iglob(before) if before else ["."]:
+        for folder, below, _ in os.walk(top, followlinks=True):
+            real = os.path.realpath(folder)
+            below[:] = [] if real in entered else sorted(name for name in below if not name.startswith("."))
+            if real not in entered:
+                entered.add(real)
+                yield from _matches(os.path.normpath(os.path.join(glob.escape(folder), after)))
 
 
 def plan(sources: Sequence[Path], output: str, *, suffix: str = "", format: str | None = None) -> list[Job]:

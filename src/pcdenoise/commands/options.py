@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 ENVIRONMENT_PREFIX = "PCDENOISE"
 """--max-move is also PCDENOISE_MAX_MOVE."""
 
+_LARGEST_CONFIG = 1 << 20
+
 option = partial(typer.Option, show_envvar=False)
 common = partial(option, rich_help_panel="Common")
 argument = partial(typer.Argument, show_envvar=False)
@@ -39,8 +41,12 @@ def _defaults_from(path: Path, context: typer.Context) -> dict[str, Any]:
         import tomli as tomllib
 
     try:
+        if path.exists() and not path.is_file():
+            raise ValueError("it is no regular file")
+        if path.stat().st_size > _LARGEST_CONFIG:
+            raise ValueError(f"larger than {_LARGEST_CONFIG} bytes")
         settings = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UsageError(f"{path}: not a readable TOML file ({_one_line(error)})") from None
     assert context.parent is not None
     group = context.parent.command

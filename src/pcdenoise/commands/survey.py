@@ -39,8 +39,10 @@ def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
     from pcdenoise import io
     from pcdenoise.cloud import noise_level
     from pcdenoise.cloud.neighbours import NeighbourSearch, distinct, spatial_order
+    from pcdenoise.cloud.scan import check_extent
 
     points = scan.points[scan.finite]
+    check_extent(points)
     extent = np.ptp(points, axis=0) if len(points) else np.zeros(3)
     places = points[distinct(points)[0]]
     system = io.coordinate_system(scan)

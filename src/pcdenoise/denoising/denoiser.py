@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pcdenoise.cloud import drift
 from pcdenoise.cloud.neighbours import distinct, spatial_order
 from pcdenoise.cloud.noise_level import NoiseLevel, estimate
-from pcdenoise.cloud.scan import Mask, Points
+from pcdenoise.cloud.scan import Mask, Points, check_extent
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import classical, outliers
 from pcdenoise.denoising.held_out import HeldOut
@@ -127,6 +127,7 @@ class _Cloud:
         self.threads = config.threads or os.cpu_count() or 1
         self.finite: Mask = np.logical_and.reduce(np.isfinite(points), axis=1)
         usable = points[self.finite]
+        check_extent(usable)
         self.origin = np.round(np.median(usable, axis=0)) if len(usable) else np.zeros(3)
         usable = usable - self.origin
         first, place = distinct(usable)

@@ -170,7 +170,7 @@ def plain(value: Any) -> Any:
 
 
 def _write(path: str | PathLike[str], text: str, overwrite: bool) -> None:
-    write_whole(path, text.encode("utf-8"), overwrite=overwrite)
+    write_whole(path, text.encode("utf-8", "backslashreplace"), overwrite=overwrite)  # names of files may be no UTF-8
 
 
 def _flat(row: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import secrets
 import shutil
 import stat
 import sys
@@ -14,9 +13,13 @@ from pathlib import Path
 from typing import BinaryIO
 
 from pcdenoise.errors import ScanError
+from pcdenoise.whole_files import replaced
 
 STREAM = "-"
 """The path that means stdin or stdout."""
+
+_PIECE = 1 << 24
+_LARGEST_STREAM_SHARE = 0.25  # of the machine's memory: a pipe may never end, and what it brings takes several times its size
 
 
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
@@ -24,8 +27,14 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
     if os.fspath(path) == STREAM:
         if sys.stdin.isatty():
             raise ScanError("stdin: nothing is piped in; give a file or pipe one to '-'")
-        return sys.stdin.buffer.read()
+        return _stream_bytes(sys.stdin.buffer, "stdin")
     try:
+        mode = os.stat(path).st_mode
+        if stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
+            raise ScanError(f"{path}: is a device; name a scan file")
+        if stat.S_ISFIFO(mode):
+            with open(path, "rb") as pipe:
+                return _stream_bytes(pipe, os.fspath(path))
         return Path(path).read_bytes()
     except IsADirectoryError:
         raise ScanError(f"{path}: is a folder; name a scan file") from None
@@ -37,11 +46,30 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
         raise ScanError(f"{path}: larger than the free memory; split it into tiles first") from None
 
 
+def _stream_bytes(stream: BinaryIO, origin: str) -> bytes:
+    """All of a pipe. Raises ScanError if that is more than memory holds."""
+    try:
+        room = _LARGEST_STREAM_SHARE * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError):  # Windows
+        room = float("inf")
+    pieces: list[bytes] = []
+    try:
+        while piece := stream.read(_PIECE):
+            pieces.append(piece)
+            if (room := room - len(piece)) < 0:
+                break
+        else:
+            return b"".join(pieces)
+    except MemoryError:
+        pass
+    raise ScanError(f"{origin}: brings more than memory holds; save it as a file and split it into tiles")
+
+
 @contextmanager
 def written(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[BinaryIO]:
     """A seekable binary file that becomes `path` only if the block ends well; '-' is stdout.
 
-    The bytes go to a hidden file beside the target, which is renamed over it at the end and removed on any failure.
+    Whether stdout's reader is still there is its own affair: BrokenPipeError passes.
     Raises ScanError if the target exists and `overwrite` is false, or cannot be written.
     """
     target = Path(os.path.realpath(path))
@@ -50,18 +78,13 @@ def written(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[Binary
             yield file
         return
     _check_target(path, target, overwrite)
-    part = target.with_name(f".{target.name[:100]}.{secrets.token_hex(4)}.part")
     try:
-        with part.open("xb+") as file:
+        with replaced(target) as file:
             yield file
-        if target.exists():
-            _check_target(path, target, overwrite)
-            part.chmod(stat.S_IMODE(target.stat().st_mode))
-        os.replace(part, target)
+            if target.exists():
+                _check_target(path, target, overwrite)
     except OSError as fault:
         raise ScanError(f"{path}: cannot be written ({fault.strerror}); check the folder's permissions and free space") from None
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _check_target(path: str | os.PathLike[str], target: Path, overwrite: bool) -> None:
@@ -90,4 +113,7 @@ def _spooled(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             shutil.copyfileobj(spool, sys.stdout.buffer)
             sys.stdout.buffer.flush()
         except OSError as fault:
-            raise ScanError(f"{path}: cannot be written ({fault.strerror}); check what reads it") from None
+            if isinstance(fault, BrokenPipeError) and os.fspath(path) == STREAM:
+                raise
+            where = "stdout" if os.fspath(path) == STREAM else path
+            raise ScanError(f"{where}: cannot be written ({fault.strerror}); check where it leads") from None

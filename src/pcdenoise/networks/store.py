@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from importlib import resources
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from pcdenoise.errors import ModelError, in_one_line
+from pcdenoise.whole_files import replaced
 
 if TYPE_CHECKING:
     from pcdenoise.networks.mcconv import MCConvNetwork
@@ -133,20 +133,22 @@ def load(name_or_folder: str | Path = DEFAULT) -> Model:
 def save(
     network: Network, folder: Path, *, summary: str, training: Mapping[str, Any], scores: Mapping[str, Any], card: str
 ) -> None:
-    """Writes a model folder; every file appears whole or not at all."""
+    """Writes a model folder; every file appears whole or not at all. Raises ModelError if one cannot be written."""
     from safetensors.torch import save as serialise
 
-    folder.mkdir(parents=True, exist_ok=True)
     config = _describe(network).model_copy(update={"summary": summary, "training": dict(training), "scores": dict(scores)})
     files = {
         WEIGHTS: serialise({name: tensor.detach().contiguous() for name, tensor in network.state_dict().items()}),
         CONFIG: (config.model_dump_json(indent=1) + "\n").encode(),
         CARD: card.encode(),
     }
-    for name, data in files.items():
-        part = folder / f".{name}.part"
-        part.write_bytes(data)
-        os.replace(part, folder / name)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, data in files.items():
+            with replaced(folder / name) as file:
+                file.write(data)
+    except OSError as fault:
+        raise ModelError(f"{folder}: cannot be saved ({fault.strerror}); check permissions and free space") from None
 
 
 def _find(name_or_folder: str | Path) -> Path:
