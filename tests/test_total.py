@@ -93,7 +93,8 @@ def test_a_network_trained_on_the_prior_of_one_noisy_sphere_denoises_another(rng
     fresh = sphere(rng, 1500)
     moved = denoise(fresh, store.load(tmp_path / "model"), DenoiseConfig(threads=1, relax_steps=0, unshrink=False)).points
     before, after = (np.sqrt(np.mean((np.linalg.norm(x, axis=1) - 0.29) ** 2)) for x in (fresh, moved))
-    # The law's slope of σ²/(σ² + s²) is 0.53 here; 80 steps of a narrow network go a part of the way. Without any it is above 1.
+    # The law's slope of σ²/(σ² + s²) is 0.53 here; 80 steps of a narrow network go a part of the way: to 0.92 when this was
+    # written. Without any it is 1.000.
     assert after < 0.95 * before
 
 
