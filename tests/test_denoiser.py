@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as hnp
 
 from known_clouds import UTM, Cloud, cloud, model, moves, rotation
 from pcdenoise import io
-from pcdenoise.cloud.neighbours import knn
+from pcdenoise.cloud.neighbours import coordinate_hash, knn
 from pcdenoise.cloud.noise_level import estimate
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import denoiser, pyramid
@@ -332,7 +332,7 @@ def test_auto_comes_within_five_percent_of_whoever_sees_the_truth(
 def test_the_held_out_residual_is_noise_and_error_together(rng: np.random.Generator) -> None:
     noise, error = 0.01, 0.006
     points = np.column_stack([rng.random((20_000, 2)), noise * rng.standard_normal(20_000)])
-    held_out = HeldOut(points, estimate(points, threads=1), 0, 1)
+    held_out = HeldOut(points, coordinate_hash(points, 0), estimate(points, threads=1), 0, 1)
 
     def denoised(half: np.ndarray) -> np.ndarray:
         return np.column_stack([half[:, :2], error * rng.standard_normal(len(half))])

@@ -9,10 +9,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
 
+from pcdenoise.cloud import neighbours
 from pcdenoise.cloud.neighbours import (
     NeighbourSearch,
     coordinate_hash,
     distinct,
+    drawn_by,
     knn,
     pairs_within,
     radius_pairs,
@@ -142,3 +144,22 @@ def test_thinning_leaves_about_the_asked_number_of_neighbours_and_says_which_sha
     assert share == pytest.approx(64 / 600, rel=0.15)
     assert len(kept) == pytest.approx(share * 20_000, rel=0.1)  # 2 100 ± 45
     assert thinned(points, points, 0.01, 64, rng)[0] == 1
+
+
+def test_row_numbers_alone_are_those_of_the_distances(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(neighbours, "_QUERIES", 37)
+    points = rng.random((200, 3))
+    search = NeighbourSearch(points, threads=1)
+    np.testing.assert_array_equal(search.nearest(points, 7), search.knn(points, 7)[1])
+    assert search.nearest(points, 500).shape == (200, 200)
+
+
+def test_draws_by_an_identity_depend_on_it_and_the_seed_alone(rng: np.random.Generator) -> None:
+    identity = coordinate_hash(rng.random((4000, 3)), 0)
+    one, other = drawn_by(identity, 1), drawn_by(identity, 2)
+    order = rng.permutation(4000)
+    np.testing.assert_array_equal(drawn_by(identity[order], 1), one[order])
+    assert len(np.unique(one)) == 4000
+    # Uniform, and independent between seeds: the mean of n uniform numbers has the standard deviation 1 / √(12 n).
+    for draws in (one, other, one ^ other):
+        assert abs(draws.mean() / 2.0**64 - 0.5) < 5 / np.sqrt(12 * 4000)

@@ -15,6 +15,7 @@ Distances = NDArray[np.float64]
 
 PAIRS_AT_ONCE = 2**20
 """About how many pairs are in memory at a time."""
+_QUERIES = 1 << 16  # asked at once where only the answer's row numbers stay
 _BITS = 21  # per axis: three axes fill 63 bits of one Morton code
 
 
@@ -59,6 +60,13 @@ class NeighbourSearch:
         k = min(k, self.n_points)
         distances, indices = self._tree.query(queries, k=np.arange(1, k + 1), workers=self.threads)
         return distances, indices.astype(np.int64, copy=False)
+
+    def nearest(self, queries: Points, k: int) -> NDArray[np.int32]:
+        """(M, k) row numbers alone, at a third of the memory."""
+        found = np.empty((len(queries), min(k, self.n_points)), np.int32)
+        for start in range(0, len(queries), _QUERIES):
+            found[start : start + _QUERIES] = self.knn(queries[start : start + _QUERIES], k)[1]
+        return found
 
 
 def knn(points: Points, k: int, queries: Points | None = None, threads: int = -1) -> tuple[Distances, Indices]:
@@ -124,14 +132,28 @@ def coordinate_hash(points: Points, seed: int) -> NDArray[np.uint64]:
     """(N,) pseudo-random numbers that depend on a point's coordinates and the seed alone: not on its row, block or tile."""
     state = np.full(len(points), np.uint64(seed) + np.uint64(0x9E3779B97F4A7C15), dtype=np.uint64)
     for axis in range(3):
-        state ^= (np.ascontiguousarray(points[:, axis]) + 0.0).view(np.uint64)
-        state = (state ^ state >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)
-        state = (state ^ state >> np.uint64(27)) * np.uint64(0x94D049BB133111EB)
-        state ^= state >> np.uint64(31)
+        state = _mixed(state ^ (np.ascontiguousarray(points[:, axis]) + 0.0).view(np.uint64))
     return state
+
+
+def drawn_by(identity: NDArray[np.uint64], seed: int) -> NDArray[np.uint64]:
+    """(N,) pseudo-random numbers that depend on numbers that stand for the points, as `coordinate_hash` gives, and the seed."""
+    return _mixed(identity ^ _mixed(np.full(1, np.uint64(seed) + np.uint64(0x9E3779B97F4A7C15), dtype=np.uint64)))
+
+
+def _mixed(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """The finaliser of splitmix64: every bit of the result depends on every bit given."""
+    state = (state ^ state >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)
+    state = (state ^ state >> np.uint64(27)) * np.uint64(0x94D049BB133111EB)
+    return state ^ state >> np.uint64(31)
 
 
 def distinct(points: Points) -> tuple[Indices, Indices]:
     """Rows (D,) of one point at each place and, for every row, which of those it coincides with (N,)."""
-    _, rows, place = np.unique(coordinate_hash(points, 0), return_index=True, return_inverse=True)
+    return distinct_by(coordinate_hash(points, 0))
+
+
+def distinct_by(identity: NDArray[np.uint64]) -> tuple[Indices, Indices]:
+    """`distinct` for points whose `coordinate_hash` is known."""
+    _, rows, place = np.unique(identity, return_index=True, return_inverse=True)
     return rows, place

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdenoise.cloud.neighbours import Indices, NeighbourSearch, distinct, spatial_order
+from pcdenoise.cloud.neighbours import Distances, Indices, NeighbourSearch, coordinate_hash, distinct, spatial_order
 from pcdenoise.cloud.scan import Points
 
 N_PROBES = 1000
@@ -53,21 +54,46 @@ def estimate(points: Points, seed: int = 0, threads: int = -1) -> NoiseLevel:
     """
     points = points[distinct(points)[0]]
     points = points[spatial_order(points)]
-    if len(points) < 2:
-        return NoiseLevel(0.0, 0.0, float(_LADDER[0]), False)
-    rng = np.random.default_rng(seed)
-    probes = points[np.sort(rng.choice(len(points), size=min(N_PROBES, len(points)), replace=False))]
+    return estimate_at(points, probes(coordinate_hash(points, seed)), threads)
+
+
+def probes(hashes: NDArray[np.uint64]) -> Indices:
+    """Rows of at most N_PROBES points drawn by their hash, as of `coordinate_hash`: the same points in any order and any part."""
+    if len(hashes) <= N_PROBES:
+        return np.arange(len(hashes))
+    return np.sort(np.argpartition(hashes, N_PROBES)[:N_PROBES])
+
+
+def estimate_at(points: Points, rows: Indices, threads: int = -1) -> NoiseLevel:
+    """`estimate` for (N, 3) points that are distinct and in spatial order already, at the probes in these rows."""
     search = NeighbourSearch(points, threads)
-    spacing = float(np.median(search.knn(probes, 2)[0][:, 1]))
-    if len(points) < _LADDER[0]:
+
+    def nearest(centres: Points, k: int) -> tuple[Distances, Points]:
+        distances, indices = search.knn(centres, k)
+        return distances, points[indices]
+
+    return estimate_from(points[rows], len(points), nearest)
+
+
+Nearest = Callable[[Points, int], tuple[Distances, Points]]
+"""(M, k) distances and (M, k, 3) positions of the k points nearest to (M, 3) points of the cloud, nearest first."""
+
+
+def estimate_from(probed: Points, n_points: int, nearest: Nearest) -> NoiseLevel:
+    """`estimate` at (M, 3) probes of a cloud that only `nearest` knows; it is asked for up to 2048 neighbours."""
+    if n_points < 2:
+        return NoiseLevel(0.0, 0.0, float(_LADDER[0]), False)
+    probed = probed[spatial_order(probed)]
+    spacing = float(np.median(nearest(probed, 2)[0][:, 1]))
+    if n_points < _LADDER[0]:
         return NoiseLevel(0.0, spacing, float(_LADDER[0]), False)
 
     rungs: list[_Rung] = []
-    for k in (k for k in _LADDER if k <= len(points)):
-        some = probes[:: max(1, N_PROBES * k // _PROBED)]
-        distances, indices = search.knn(some, k)
+    for k in (k for k in _LADDER if k <= n_points):
+        some = probed[:: max(1, N_PROBES * k // _PROBED)]
+        distances, near = nearest(some, k)
         radius = np.maximum(distances[:, -1], 1e-300)
-        aspect = 1 / np.maximum(_quadric_residual(points, some, radius, indices), 1e-6)
+        aspect = 1 / np.maximum(_quadric_residual(near, some, radius), 1e-6)
         clear = float(np.quantile(aspect, 1 - _CLEARER_SHARE))
         std = float(np.median((radius / aspect)[aspect >= np.quantile(aspect, 0.5)]))
         rungs.append(_Rung(k, float(np.median(radius)), clear, std / _share_seen(clear)))
@@ -77,7 +103,7 @@ def estimate(points: Points, seed: int = 0, threads: int = -1) -> NoiseLevel:
     if not shown:
         return NoiseLevel(max(rungs, key=lambda rung: rung.aspect).std, spacing, float(_LADDER[0]), False)
     std = shown[0].std
-    certain = shown[0].k <= _SMALL_SHARE * len(points) or max(rung.aspect for rung in shown) >= _CERTAIN_ASPECT
+    certain = shown[0].k <= _SMALL_SHARE * n_points or max(rung.aspect for rung in shown) >= _CERTAIN_ASPECT
     return NoiseLevel(std, spacing, _points_within(_SCALE_STDS * std, rungs), certain)
 
 
@@ -104,7 +130,7 @@ def around(points: Points, level: NoiseLevel, at: Points | None = None, seed: in
         for block in np.array_split(np.flatnonzero(np.isnan(std)), max(1, len(places) * k // _PROBED)):
             distances, indices = search.knn(places[block], k)
             radius = np.maximum(distances[:, -1], 1e-300)
-            aspect = 1 / np.maximum(_quadric_residual(cloud, places[block], radius, indices), 1e-6)
+            aspect = 1 / np.maximum(_quadric_residual(cloud[indices], places[block], radius), 1e-6)
             shown = aspect >= _CERTAIN_ASPECT
             std[block[shown]] = (radius / aspect)[shown] / np.interp(aspect[shown], *_SEEN)
     nearest = NeighbourSearch(places, threads).knn(at, 3)[1]
@@ -135,9 +161,9 @@ def _share_seen(aspect: float) -> float:
     return float(np.interp(aspect, *_SEEN))
 
 
-def _quadric_residual(points: Points, centres: Points, radius: NDArray[np.float64], indices: Indices) -> NDArray[np.float64]:
-    """(M,) standard deviation that a quadric over the PCA plane leaves in each neighbourhood, as a share of its radius."""
-    near = (points[indices] - centres[:, None]) / radius[:, None, None]
+def _quadric_residual(near: Points, centres: Points, radius: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(M,) standard deviation that a quadric over the PCA plane leaves in (M, k, 3) neighbourhoods, as a share of the radius."""
+    near = (near - centres[:, None]) / radius[:, None, None]
     near -= near.mean(axis=1, keepdims=True)
     frames = np.linalg.eigh(near.transpose(0, 2, 1) @ near)[1]
     height, u, v = np.moveaxis(near @ frames, 2, 0)

@@ -18,6 +18,14 @@ Mask = NDArray[np.bool_]
 _EXTENTS = (1e-15, 1e15)
 
 
+def within(reach: float, start: Points, moved: Points) -> Points:
+    """(N, 3) moved points, but none further than `reach` from its start."""
+    slide = moved - start
+    length = np.linalg.norm(slide, axis=1, keepdims=True)
+    cut: Points = start + slide * (reach / np.maximum(length, max(reach, 1e-300)))
+    return cut
+
+
 @dataclass(frozen=True)
 class Scan:
     """N points in file order and all that the file said about them.

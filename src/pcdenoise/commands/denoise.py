@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pcdenoise.commands import options, outputs, selection
 from pcdenoise.commands.batch import Batch, Figures
 from pcdenoise.commands.console import Console, figure, table
-from pcdenoise.commands.files import Job, expand, format_of, plan, refuse_existing
+from pcdenoise.commands.files import STREAM, Job, expand, format_of, plan, refuse_existing
+from pcdenoise.commands.memory import n_bytes
 from pcdenoise.commands.options import configured, option
 from pcdenoise.commands.undo import with_displacement
 from pcdenoise.commands.verify import MaxDrift, check_drift
@@ -21,9 +22,13 @@ if TYPE_CHECKING:
     from pcdenoise.cloud.scan import Scan
     from pcdenoise.config import DenoiseConfig
     from pcdenoise.denoising.denoiser import Result
+    from pcdenoise.denoising.tiles import Rows
     from pcdenoise.evaluation.report import Page
+    from pcdenoise.io import Stream
     from pcdenoise.networks.store import Model
 
+
+_PIECE_ROWS = 250_000
 
 Method = Annotated[
     Literal["network", "mean", "bilateral", "jet"], option("--method", help="The learned model or a classical filter.")
@@ -63,6 +68,12 @@ def denoise(
     displacement: Annotated[
         bool, option("--displacement", help="Store where each point was and how far it moved; undo needs it.")
     ] = False,
+    max_memory: Annotated[
+        str | None,
+        option("--max-memory", metavar="SIZE", help="Never hold more than this: 800M, 2G; half of what is free if not given."),
+    ] = None,
+    tile: Annotated[int | None, option("--tile", min=1000, help="Clean in cells on disk, of so many points.")] = None,
+    resume: Annotated[bool, option("--resume", help="Go on with the cells of a run that was killed.")] = False,
     format: options.Format = None,
     suffix: Annotated[str, option("--suffix", help="Put between name and extension when the output is a folder.")] = "",
     overwrite: options.Overwrite = False,
@@ -102,7 +113,7 @@ def denoise(
     chosen = selection.Selection.of(only_class, context, roi)
     cleaning = _Cleaning(
         settings, chosen, chosen_model(model, settings), console, format, overwrite, drop_attributes, displacement, max_drift,
-        pictures,
+        pictures, n_bytes(max_memory), tile, resume,
     )  # fmt: skip
     batch = Batch(console)
     batch.run(jobs, cleaning.clean)
@@ -137,6 +148,9 @@ class _Cleaning:
     displacement: bool
     max_drift: float | None
     pictures: dict[Path, Path]
+    max_bytes: int
+    tile: int | None = None
+    resume: bool = False
     pages: list[Page] = field(default_factory=list)
 
     @property
@@ -146,7 +160,70 @@ class _Cleaning:
         return {**self.config.model_dump(mode="json"), **self.selection.settings, **named}
 
     def clean(self, job: Job) -> Figures:
-        """Reads one scan, cleans it, writes it with its picture, and returns its figures."""
+        """Reads one scan, cleans it, writes it with its picture, and returns its figures; in cells on disk if it is too large."""
+        from pcdenoise import io
+        from pcdenoise.denoising.tiles import needed_bytes
+
+        with io.streamed(job.source, format=format_of(job.source, self.format)) as stream:
+            if stream is not None and (self.tile or needed_bytes(stream.n_points) > self.max_bytes):
+                return self._clean_in_cells(job, stream)
+        if self.tile:
+            self.console.note(f"{job.source}: read whole; only LAS, LAZ, binary PLY and text files are cleaned in cells")
+        return self._clean_whole(job)
+
+    def _clean_in_cells(self, job: Job, stream: Stream) -> Figures:
+        """The same for a scan that need not fit in memory: rows are streamed, cells lie in a folder beside the target."""
+        from pcdenoise import io
+        from pcdenoise.denoising.tiles import Tiles, needs_the_whole, points_per_cell
+
+        started = time.perf_counter()
+        written = format_of(job.target, self.format) or io.SUFFIXES.get(job.target.suffix.lower(), stream.format)
+        global_ = needs_the_whole(self.model, self.config)
+        for is_asked, fault in (
+            (self.config.outliers == "remove", "--outliers remove: use --outliers flag"),
+            (self.selection != selection.Selection(), "--only-class and --roi: leave them out"),
+            (global_, f"{global_}: leave it out"),
+            (job.source in self.pictures, "--picture: leave it out"),
+            (not io.same_kind(stream.format, written), f"conversion to {written}: keep {stream.format}"),
+            (job.target == STREAM, "output to a pipe: write to a file"),
+        ):
+            if is_asked:
+                raise UsageError(
+                    f"{job.source}: {stream.n_points:,} points are cleaned in cells, which does not go with {fault}, "
+                    "or raise --max-memory"
+                )
+        cell_points = self.tile or points_per_cell(self.max_bytes)
+        job.target.parent.mkdir(parents=True, exist_ok=True)
+        folder = job.target.with_name(f".{job.target.name}.cells")
+        about = job.source.stat()
+        tiles = Tiles(
+            folder, lambda: (piece.points for piece in stream.pieces(_PIECE_ROWS)), self.model, self.config, cell_points,
+            {"source": str(job.source.resolve()), "size": about.st_size, "changed": about.st_mtime_ns},
+        )  # fmt: skip
+        if not self.resume:
+            tiles.remove()
+        self.console.detail(f"{job.source}: {stream.n_points:,} points in cells of {cell_points:,}, kept in {folder}")
+        with self.console.progress(job.source.name) as on_progress:
+            tiles.run(on_progress)
+            check_drift(job.target, tiles.figures["drift"], tiles.figures["noise"], self.max_drift)
+            pieces = (self._piece(scan, rows) for scan, rows in zip(stream.pieces(_PIECE_ROWS), tiles.rows(), strict=True))
+            io.write_streamed(
+                stream, pieces, job.target, format=format_of(job.target, self.format), overwrite=self.overwrite,
+                provenance=outputs.provenance("denoise", self.settings),
+            )  # fmt: skip
+        tiles.remove()
+        figures = {"points": stream.n_points, **tiles.figures, "seconds": round(time.perf_counter() - started, 3)}
+        self.console.note(f"{job.target}: {_summary(figures)}")
+        return figures
+
+    def _piece(self, scan: Scan, rows: Rows) -> Scan:
+        """Some rows moved, with the columns that were asked for."""
+        cleaned = scan.moved_to(rows.points)
+        if self.displacement:
+            cleaned = with_displacement(scan.points, cleaned)
+        return cleaned.with_attributes(outlier=rows.outlier.astype("u1")) if self.config.outliers == "flag" else cleaned
+
+    def _clean_whole(self, job: Job) -> Figures:
         from pcdenoise import io
         from pcdenoise.commands.survey import traps
         from pcdenoise.denoising import denoiser

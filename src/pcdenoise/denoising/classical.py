@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from pcdenoise.cloud import noise_level
 from pcdenoise.cloud.neighbours import Distances, Indices, NeighbourSearch, spatial_order
+from pcdenoise.cloud.noise_level import NoiseLevel
 from pcdenoise.cloud.scan import Points
 from pcdenoise.errors import UsageError
 
@@ -28,12 +29,13 @@ _LINE = 1e-10  # ratio of the second to the first PCA eigenvalue below which the
 _RIDGE = 1e-9  # beside a mean squared term near one: neighbours on two scan lines do not fix all six parameters
 
 
-def mean(points: Points, k: int | None = None, *, threads: int = -1) -> Points:
+def mean(points: Points, k: int | None = None, *, level: NoiseLevel | None = None, threads: int = -1) -> Points:
     """Moves each point to the mean of its k nearest points, itself included. Shrinks curved surfaces and clumps points.
 
-    k None fits the noise level; fewer than k points stay where they are. Raises UsageError for k < 1.
+    k None fits the noise level, which is measured if not given; fewer than k points stay where they are. Raises UsageError for
+    k < 1.
     """
-    k = _neighbourhood_size(points, 1, threads) if k is None else _positive_count("k", k)
+    k = neighbourhood_size(level or noise_level.estimate(points, threads=threads), 1) if k is None else _positive_count("k", k)
     moved = points.copy()
     if len(points) < k:
         return moved
@@ -42,16 +44,20 @@ def mean(points: Points, k: int | None = None, *, threads: int = -1) -> Points:
     return moved
 
 
-def jet(points: Points, k: int | None = None, degree: int = 2, *, threads: int = -1) -> Points:
+def jet(points: Points, k: int | None = None, degree: int = 2, *, level: NoiseLevel | None = None, threads: int = -1) -> Points:
     """Moves each point along its normal onto a height field fitted to its k nearest points, itself included.
 
     Weighted least squares in the PCA frame (Cazals and Pouget, "Estimating differential quantities using polynomial fitting
     of osculating jets", 2003), weights exp(-1.5 (distance / largest distance)²); degree 1 is a plane, 2 a quadric.
-    k None fits the noise level. Raises UsageError for k < 1 or another degree.
+    k None fits the noise level, which is measured if not given. Raises UsageError for k < 1 or another degree.
     """
     if degree not in (1, 2):
         raise UsageError(f"degree: {degree} is not offered; use 1 (plane) or 2 (quadric)")
-    k = _neighbourhood_size(points, degree, threads) if k is None else _positive_count("k", k)
+    k = (
+        neighbourhood_size(level or noise_level.estimate(points, threads=threads), degree)
+        if k is None
+        else _positive_count("k", k)
+    )
     moved = points.copy()
     for rows, centres, distances, offsets in _neighbourhoods(points, k, threads):
         reach = np.maximum(distances[:, -1], np.finfo(float).tiny)
@@ -74,21 +80,22 @@ def bilateral(
     *,
     iterations: int = 1,
     max_neighbours: int = 256,
+    level: NoiseLevel | None = None,
     threads: int = -1,
 ) -> Points:
     """Moves each point along its normal by the mean height of the points around it, near ones counting more.
 
     Digne and de Franchis, "The Bilateral Filter for Point Clouds" (IPOL 2017): weights exp(-d² / 2σ_d² - h² / 2σ_n²) in a ball,
     d the distance and h the height over the tangent plane; its normal is the PCA normal of the ball. Lengths are in the points'
-    unit. By default radius = max(4 noise stds, 4 spacings), σ_d = radius / 2, σ_n = 3 noise stds; the noise is measured once.
+    unit. By default radius = max(4 noise stds, 4 spacings), σ_d = radius / 2, σ_n = 3 noise stds; the noise is measured if not given.
     Of a ball with more than `max_neighbours` points the nearest count. Without measurable noise (too few points, exact planes)
     there is no default, and points stay where they are. Raises UsageError unless every argument is above 0.
     """
     if radius is None or sigma_n is None:
-        level = noise_level.estimate(points, threads=threads)
+        level = level or noise_level.estimate(points, threads=threads)
         if level.std == 0:
             return points.copy()
-        radius = max(4 * level.std, 4 * level.spacing) if radius is None else radius
+        radius = ball_radius(level) if radius is None else radius
         sigma_n = 3 * level.std if sigma_n is None else sigma_n
     sigma_d = radius / 2 if sigma_d is None else sigma_d
     for name, length in (("radius", radius), ("sigma_d", sigma_d), ("sigma_n", sigma_n)):
@@ -152,14 +159,18 @@ def _positive_count(name: str, value: int) -> int:
     return value
 
 
-def _neighbourhood_size(points: Points, degree: int, threads: int) -> int:
-    """How many points a fit of that degree needs at this cloud's noise; a mean needs as many as a plane.
+def ball_radius(level: NoiseLevel) -> float:
+    """The bilateral filter's ball at a cloud's noise."""
+    return max(4 * level.std, 4 * level.spacing)
+
+
+def neighbourhood_size(level: NoiseLevel, degree: int) -> int:
+    """How many points a fit of that degree needs at a cloud's noise; a mean needs as many as a plane.
 
     The root of what shows the surface: under strong noise it is curvature that limits the fit. Both constants are fitted to the
     best sizes on training meshes of 10K and 50K points with noise of 0.5 to 3 % of the radius.
     """
-    scale_points = noise_level.estimate(points, threads=threads).scale_points
-    size: int = round(max(27.0, 7.5 * scale_points**0.5) * degree / 2)
+    size: int = round(max(27.0, 7.5 * level.scale_points**0.5) * degree / 2)
     return size
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from threading import Lock
@@ -17,13 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdenoise.cloud import drift
-from pcdenoise.cloud.neighbours import distinct, spatial_order
-from pcdenoise.cloud.noise_level import NoiseLevel, estimate
-from pcdenoise.cloud.scan import Mask, Points, check_extent
+from pcdenoise.cloud.neighbours import coordinate_hash, distinct_by, drawn_by, spatial_order
+from pcdenoise.cloud.noise_level import NoiseLevel, estimate, estimate_at, probes
+from pcdenoise.cloud.scan import Mask, Points, check_extent, within
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import classical, outliers
 from pcdenoise.denoising.held_out import HeldOut
-from pcdenoise.denoising.relaxation import relax, within, without_low_frequencies
 from pcdenoise.errors import ModelError, UsageError
 from pcdenoise.networks.store import Model
 
@@ -33,6 +31,8 @@ if TYPE_CHECKING:
 
 FEWEST_POINTS = 16
 """Smaller clouds come back as they were: no surface can be told from them."""
+N_CENTRAL = 1 << 16
+"""Points whose median becomes the local frame's origin."""
 _MOST_PASSES = 10
 _SHRINKING = 0.035
 """Radius over which moves that all points share are taken back, in the network's units of length; as released."""
@@ -44,6 +44,8 @@ _WORTHWHILE = 2e-4
 _NOTHING = 1e-6
 """Of the spacing: a residual that falls by less is that of a cloud without noise."""
 
+Identity = NDArray[np.uint64]
+"""(N,) the `coordinate_hash` of where points were in the file: a part of a cloud draws by it as the whole does, in any pass."""
 Progress = Callable[[str, float], None]
 """Called with what is being done and the share of it that is done, 0 to 1."""
 
@@ -87,7 +89,7 @@ def denoise(
     cloud = _Cloud(points, config, level)
     found = np.zeros(len(points), dtype=bool)
     if config.outliers != "keep" and len(cloud.start) >= FEWEST_POINTS:
-        found = cloud.to_rows(outliers.find(cloud.start, threads=cloud.threads), False)
+        found = cloud.to_rows(outliers.find(cloud.start, level=cloud.level, threads=cloud.threads), False)
     steps = list(_passes(cloud, model, config, on_progress or (lambda _task, _share: None)))
     moved = steps[-1].points if steps else cloud.start
     unmoved = cloud.unmoved(moved)
@@ -128,15 +130,17 @@ class _Cloud:
         self.finite: Mask = np.logical_and.reduce(np.isfinite(points), axis=1)
         usable = points[self.finite]
         check_extent(usable)
-        self.origin = np.round(np.median(usable, axis=0)) if len(usable) else np.zeros(3)
-        usable = usable - self.origin
-        first, place = distinct(usable)
+        identity = coordinate_hash(usable, 0)
+        first, place = distinct_by(identity)
+        self.origin = origin_of(usable[first[:N_CENTRAL]])  # `distinct_by` sorts by the hash, so these are drawn by it
         order = spatial_order(usable[first])
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
-        self.start: Points = usable[first][order]
+        self.start: Points = usable[first][order] - self.origin
+        self.identity: Identity = identity[first][order]
         self._row = back[place]
-        self.level: NoiseLevel = level or estimate(self.start, config.seed, self.threads)
+        self.probes = probes(drawn_by(self.identity, config.seed))
+        self.level: NoiseLevel = level or estimate_at(self.start, self.probes, self.threads)
         self.diagonal = float(np.linalg.norm(np.ptp(self.start, axis=0))) if len(self.start) else 0.0
 
     def to_rows(self, values: NDArray[Any], missing: Any) -> NDArray[Any]:
@@ -154,10 +158,49 @@ class _Cloud:
         """(N, 3) input rows at their new places; those that stay keep every bit, which the way over the origin may cost."""
         return np.where(self.unmoved(moved)[:, None], self.rows, self.to_rows(moved, np.nan))
 
-    def limited(self, moved: Points) -> Points:
-        """Moves scaled by the strength and cut to the longest that is allowed."""
-        blended = self.start + self.config.strength * (moved - self.start)
-        return blended if self.config.max_move is None else within(self.config.max_move, self.start, blended)
+
+def origin_of(points: Points) -> Points:
+    """(3,) whole numbers in the middle of (N, 3) points, those of the N_CENTRAL smallest hashes: the local frame's origin."""
+    return np.round(np.median(points, axis=0)) if len(points) else np.zeros(3)
+
+
+def limited(start: Points, moved: Points, config: DenoiseConfig) -> Points:
+    """Moves scaled by the strength and cut to the longest that is allowed."""
+    blended = start + config.strength * (moved - start)
+    return blended if config.max_move is None else within(config.max_move, start, blended)
+
+
+def most_passes(n_points: int, level: NoiseLevel, config: DenoiseConfig) -> int:
+    """How many passes there are at most over so many distinct points; none where there is nothing to clean."""
+    no_surface = config.method == "network" and not level.is_surface
+    if n_points < FEWEST_POINTS or config.strength == 0 or no_surface:
+        return 0
+    return _MOST_PASSES if config.iters == "auto" else config.iters
+
+
+class Judge:
+    """Held-out points and what they say of pass after pass. Which passes are worth making is theirs to say under `auto`."""
+
+    def __init__(
+        self, held_out: HeldOut, level: NoiseLevel, diagonal: float, model: Model | None, config: DenoiseConfig, threads: int
+    ) -> None:
+        self._held_out, self._least = held_out, np.inf
+        self._nothing = _NOTHING * level.spacing
+        self._model, self._config, self._diagonal, self._threads = model, config, diagonal, threads
+
+    def residual(self) -> float | None:
+        """The residual after one more pass; None where `auto` makes it no more."""
+
+        def fresh_pass(points: Points) -> Points:  # over points whose noise nobody has measured yet
+            level = estimate(points, self._config.seed, self._threads)
+            identity = self._held_out.identity
+            return one_pass(points, identity, level, self._diagonal, self._model, self._config, self._threads)
+
+        found = self._held_out.after(fresh_pass)
+        if self._config.iters == "auto" and found > (1 - _WORTHWHILE) * self._least - self._nothing:
+            return None
+        self._least = found
+        return found
 
 
 def _passes(
@@ -167,24 +210,22 @@ def _passes(
 
     `is_judged`: each pass is also made on half of the points and judged by the other half, as `auto` does anyway.
     """
-    no_surface = config.method == "network" and not cloud.level.is_surface
-    if len(cloud.start) < FEWEST_POINTS or config.strength == 0 or no_surface:
-        return
-    auto = config.iters == "auto"
-    n_passes = _MOST_PASSES if config.iters == "auto" else config.iters
-    held_out = HeldOut(cloud.start, cloud.level, config.seed, cloud.threads) if auto or is_judged else None
-    least = np.inf
-    points, level = cloud.start, cloud.level
+    points, level, judge = cloud.start, cloud.level, None
+    n_passes = most_passes(len(points), level, config)
+    if n_passes and (config.iters == "auto" or is_judged):
+        held_out = HeldOut(points, cloud.identity, level, config.seed, cloud.threads)
+        judge = Judge(held_out, level, cloud.diagonal, model, config, cloud.threads)
     for number in range(1, n_passes + 1):
-        task = f"pass {number}" if auto or n_passes > 1 else "cleaning"
+        task = "cleaning" if config.iters == 1 else f"pass {number}"
         judgement = {}
-        if held_out is not None:
-            residual = held_out.after(partial(_fresh_pass, cloud=cloud, model=model))
-            if auto and residual > (1 - _WORTHWHILE) * least - _NOTHING * cloud.level.spacing:
+        if judge is not None:
+            residual = judge.residual()
+            if residual is None:
                 return
-            judgement, least = {"held_out": residual}, residual
-        moved = _one_pass(points, level, cloud, model, partial(on_progress, task))
-        after = estimate(moved, config.seed, cloud.threads)
+            judgement = {"held_out": residual}
+        on_share = partial(on_progress, task)
+        moved = one_pass(points, cloud.identity, level, cloud.diagonal, model, config, cloud.threads, on_share)
+        after = estimate_at(moved, cloud.probes, cloud.threads)
         length = np.linalg.norm(moved - points, axis=1)
         figures = {
             "iteration": number,
@@ -195,55 +236,54 @@ def _passes(
             **judgement,
         }
         points, level = moved, after
-        yield Step(cloud.limited(points), figures)
+        yield Step(limited(cloud.start, points, config), figures)
 
 
-def _fresh_pass(points: Points, cloud: _Cloud, model: Model | None) -> Points:
-    """One pass over points whose noise nobody has measured yet."""
-    return _one_pass(points, estimate(points, cloud.config.seed, cloud.threads), cloud, model, lambda _share: None)
+def one_pass(
+    points: Points,
+    identity: Identity,
+    level: NoiseLevel,
+    diagonal: float,
+    model: Model | None,
+    config: DenoiseConfig,
+    threads: int,
+    on_share: Callable[[float], None] = lambda _share: None,
+) -> Points:
+    """(N, 3) distinct points in spatial order one pass on: a cloud of that noise and diagonal, or some of it, on its way.
 
-
-def _one_pass(points: Points, level: NoiseLevel, cloud: _Cloud, model: Model | None, on_share: Callable[[float], None]) -> Points:
-    """One pass over (N, 3) points that are the cloud's, or some of them, on their way."""
-    config, threads = cloud.config, cloud.threads
+    Strength and limit are not applied.
+    """
     if config.method != "network":
-        moved = _filtered(points, cloud.diagonal, config, threads)
-        return _unshrunk(points, moved, cloud.diagonal, config) if config.unshrink else moved
+        moved = _filtered(points, level, diagonal, config, threads)
+        return _unshrunk(points, moved, diagonal, config) if config.unshrink else moved
     if model is None:
         raise UsageError("--method network needs a model; give --model, or choose --method jet")
+    from pcdenoise.denoising.relaxation import relax
     from pcdenoise.networks.mcconv import MCConvNetwork
 
     if isinstance(model.network, MCConvNetwork):
-        unit = model.network.config.unit or cloud.diagonal
+        unit = model.network.config.unit or diagonal
         moved = _mcconv_pass(points, unit, model.network, config.seed, threads, on_share)
         moved = moved if config.unshrink is False else _unshrunk(points, moved, unit, config)
     else:
-        moved = _projection_pass(points, level, model.network, config.seed, threads, on_share)
-        moved = _unshrunk(points, moved, cloud.diagonal, config) if config.unshrink else moved
+        moved = _projection_pass(points, identity, level, model.network, config.seed, threads, on_share)
+        moved = _unshrunk(points, moved, diagonal, config) if config.unshrink else moved
     return relax(within(_FURTHEST_STDS * level.std, points, moved), level.std, config.relax_steps, threads)
 
 
-def _filtered(points: Points, diagonal: float, config: DenoiseConfig, threads: int) -> Points:
+def _filtered(points: Points, level: NoiseLevel, diagonal: float, config: DenoiseConfig, threads: int) -> Points:
+    """What is not given follows from the level, not from these points, which may be a part."""
     if config.method == "bilateral":
         shares = (config.radius, config.sigma_d, config.sigma_n)
-        return classical.bilateral(points, *(None if share is None else share * diagonal for share in shares), threads=threads)
-    return classical.FILTERS[config.method](points, config.neighbours, threads=threads)
+        lengths = (None if share is None else share * diagonal for share in shares)
+        return classical.bilateral(points, *lengths, level=level, threads=threads)
+    return classical.FILTERS[config.method](points, config.neighbours, level=level, threads=threads)
 
 
 def _unshrunk(points: Points, moved: Points, unit: float, config: DenoiseConfig) -> Points:
+    from pcdenoise.denoising.relaxation import without_low_frequencies
+
     return points + without_low_frequencies(points, moved - points, _SHRINKING * unit, np.random.default_rng(config.seed))
-
-
-@contextmanager
-def _torch_threads(number: int) -> Iterator[None]:
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(number)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _mcconv_pass(
@@ -252,11 +292,13 @@ def _mcconv_pass(
     """In the network's frame. Only the first level, which is small, is looked at as a whole; the points follow in blocks."""
     import torch
 
+    from pcdenoise.denoising.blocks import torch_threads
+
     rng = np.random.default_rng(seed)
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     local = torch.from_numpy((points - centre) / unit)
     moves = []
-    with _torch_threads(threads), torch.no_grad():
+    with torch_threads(threads), torch.no_grad():
         code = network.encode(local, rng)
         for start in range(0, len(points), _DECODED_AT_ONCE):
             moves.append(network.decode(code, local[start : start + _DECODED_AT_ONCE], rng).double().numpy())
@@ -268,17 +310,24 @@ def _mcconv_pass(
 
 
 def _projection_pass(
-    points: Points, level: NoiseLevel, network: ProjectionNetwork, seed: int, threads: int, on_share: Callable[[float], None]
+    points: Points,
+    identity: Identity,
+    level: NoiseLevel,
+    network: ProjectionNetwork,
+    seed: int,
+    threads: int,
+    on_share: Callable[[float], None],
 ) -> Points:
     import torch
 
+    from pcdenoise.denoising.blocks import torch_threads
     from pcdenoise.denoising.pyramid import coarsen, descend, share_of_seeds
 
     share = share_of_seeds(level, network.config.neighbours)
     done, counting = 0, Lock()
     seeds, count, cell = points, None, np.arange(len(points))
     if share < 1:
-        coarse = coarsen(points, share, seed, threads)
+        coarse = coarsen(points, share, seed, threads, identity)
         seeds, count, cell = coarse.points, coarse.count, coarse.cell
     total = len(seeds) * sum(network.config.rounds) + (len(points) * network.config.landing_rounds if share < 1 else 0)
 
@@ -288,8 +337,7 @@ def _projection_pass(
             done += n
             on_share(done / total)
 
-    # `descend` has threads of its own; torch's would wait for each other.
-    with _torch_threads(1), torch.no_grad():
+    with torch_threads(1), torch.no_grad():
         descent = descend(network, seeds, count, points if share < 1 else None, level.std, threads=threads, on_block=on_block)
         moved: Points = (descent.seeds[-1] if descent.landed is None else descent.landed).numpy()
     trust = descent.trust.numpy().astype(np.float64)[cell, None]

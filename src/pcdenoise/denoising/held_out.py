@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pcdenoise.cloud.neighbours import NeighbourSearch, coordinate_hash
+from pcdenoise.cloud.neighbours import NeighbourSearch, drawn_by
 from pcdenoise.cloud.noise_level import NoiseLevel
 from pcdenoise.cloud.scan import Points
 
@@ -27,16 +28,18 @@ class HeldOut:
     Both see the same surface, and the noise of one says nothing about that of the other. So the mean squared height of a cleaned
     point over raw, held-out ones is the noise's variance plus its squared error; the first never changes. Which ones it is above
     is decided along the surface alone: the nearest ones in space err to the same side as the point.
+
+    identity (N,): the `coordinate_hash` of where the points were in the file; afterwards that of the cleaned half.
     """
 
-    def __init__(self, points: Points, level: NoiseLevel, seed: int, threads: int) -> None:
-        number = coordinate_hash(points, seed)
+    def __init__(self, points: Points, identity: NDArray[np.uint64], level: NoiseLevel, seed: int, threads: int) -> None:
+        number = drawn_by(identity, seed)
         if len(points) > MOST_POINTS:
             distance = np.linalg.norm(points - points[number.argmin()], axis=1)
             nearest = np.argpartition(distance, MOST_POINTS)[:MOST_POINTS]
-            points, number = points[nearest], number[nearest]
+            points, number, identity = points[nearest], number[nearest], identity[nearest]
         seen = number >> np.uint64(63) == 0
-        self.cleaned, self._held = points[seen], points[~seen]
+        self.cleaned, self._held, self.identity = points[seen], points[~seen], identity[seen]
         self._search = NeighbourSearch(self._held, threads)
         self._k = int(np.clip(level.scale_points / 2, *_NEIGHBOURS))
         self._limit = _FURTHEST_STDS * level.std

@@ -42,11 +42,19 @@ _MAX_COMPANY = 1
 _BLOCK_POINTS = 4096
 
 
-def find(points: Points, *, isolation: float = 4.0, deviation: float = 6.0, threads: int = -1) -> Mask:
+def find(
+    points: Points,
+    *,
+    isolation: float = 4.0,
+    deviation: float = 6.0,
+    level: noise_level.NoiseLevel | None = None,
+    threads: int = -1,
+) -> Mask:
     """(N,) whether each of (N, 3) finite points is an outlier. Exact duplicates count once and share the answer.
 
     isolation: how many times the reach of its surroundings a lonely point has; 4 spares densities that jump tenfold.
-    deviation: how many noise stds a gross error is off its surface. Fewer than 49 distinct points: none is an outlier.
+    deviation: how many noise stds a gross error is off its surface. level: the noise,
+    measured if not given. Fewer than 49 distinct points: none is an outlier.
     Raises UsageError for isolation <= 1 or deviation <= 0.
     """
     if isolation <= 1:
@@ -64,7 +72,7 @@ def find(points: Points, *, isolation: float = 4.0, deviation: float = 6.0, thre
             break
         kept = kept[~lonely]
     outlier = np.ones(len(places), dtype=np.bool_)
-    outlier[kept] = _off_surface(places[kept], deviation, threads)
+    outlier[kept] = _off_surface(places[kept], deviation, level, threads)
     return outlier[place]
 
 
@@ -78,11 +86,11 @@ def _lonely(points: Points, isolation: float, threads: int) -> Mask:
     return lonely
 
 
-def _off_surface(points: Points, deviation: float, threads: int) -> Mask:
+def _off_surface(points: Points, deviation: float, level: noise_level.NoiseLevel | None, threads: int) -> Mask:
     """(N,) whether each point is so many noise stds off the flat parts around it, and alone there."""
     search = NeighbourSearch(points, threads)
     reach = _reach(search, points)
-    planes = _planes(search, points, threads)
+    planes = _planes(search, points, level or noise_level.estimate(points, threads=threads))
     stds_off = np.empty(len(points))  # 0 where it is less than creases are
     for rows, _, indices in _neighbours(search, points, _SUPPORT_POINTS):
         offsets = points[rows][:, None] - planes.centre[indices]
@@ -110,9 +118,9 @@ class _Planes:
     thickness: Floats
 
 
-def _planes(search: NeighbourSearch, points: Points, threads: int) -> _Planes:
+def _planes(search: NeighbourSearch, points: Points, level: noise_level.NoiseLevel) -> _Planes:
     """Iteratively reweighted PCA with Cauchy weights, over as many points as it takes to see a surface in the noise."""
-    k = int(np.clip(noise_level.estimate(points, threads=threads).scale_points, 16, _SURROUNDINGS))
+    k = int(np.clip(level.scale_points, 16, _SURROUNDINGS))
     normal, centre, thickness = np.empty_like(points), np.empty_like(points), np.empty(len(points))
     for rows, distances, indices in _neighbours(search, points, k):
         offsets = points[indices] - points[rows][:, None]

@@ -7,40 +7,36 @@ rules (denoiser.py).
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pcdenoise.cloud.neighbours import Indices, NeighbourSearch, coordinate_hash
+from pcdenoise.cloud.neighbours import Indices, NeighbourSearch, coordinate_hash, drawn_by
 from pcdenoise.cloud.noise_level import NoiseLevel
 from pcdenoise.cloud.scan import Points
+from pcdenoise.denoising.blocks import BLOCK_POINTS, in_blocks
 from pcdenoise.errors import ModelError
 from pcdenoise.networks.projection import (
     Edges,
     Planes,
     ProjectionNetwork,
     Stage,
+    at,
     edge_features,
     edges,
-    joined,
     planes,
     point_features,
     trust,
 )
-
-T = TypeVar("T")
 
 _APART = {1: 0.52, 2: 0.39, 3: 0.31, 5: 0.23}
 """Share of candidates that remain when none may be among the so many nearest of another (measured)."""
 _LANDSCAPE = 11.0
 """Neighbourhoods hold 11·√(points that show the surface) raw points: the balance of noise, which asks for all of them, and of
 curvature, which asks for few (measured on shapes that serve for nothing else)."""
-BLOCK_POINTS = 2048
 
 
 @dataclass(frozen=True)
@@ -59,17 +55,20 @@ def share_of_seeds(level: NoiseLevel, neighbours: int) -> float:
     return min(share, densest) if share < 1.5 * densest else 1.0
 
 
-def coarsen(points: Points, share: float, seed: int = 0, threads: int = -1) -> Seeds:
+def coarsen(points: Points, share: float, seed: int = 0, threads: int = -1, identity: NDArray[np.uint64] | None = None) -> Seeds:
     """About share * N seeds of (N, 3) finite points in spatial order, spread evenly relative to the local density.
 
+    identity (N,): what to draw by in place of the coordinates, for points whose last bits depend on how they were computed.
     Candidates are drawn by hash; those that are first among their nearest candidates stay, round by round; every raw point
     then joins its nearest seed. Averaging inside the cells keeps the statistical weight of every raw point.
     """
     apart = max((n for n, left in _APART.items() if left >= share), default=1)
-    candidates = points[coordinate_hash(points, seed) < np.uint64(min(share / _APART[apart], 1.0) * float(2**64 - 2**11))]
+    drawn = drawn_by(coordinate_hash(points, 0) if identity is None else identity, seed)
+    is_candidate = drawn < np.uint64(min(share / _APART[apart], 1.0) * float(2**64 - 2**11))
+    candidates = points[is_candidate]
     if len(candidates) <= apart + 1:
         return Seeds(points, np.ones(len(points)), np.arange(len(points)))
-    chosen = candidates[_first_among_nearest(candidates, coordinate_hash(candidates, seed + 1), apart, threads)]
+    chosen = candidates[_first_among_nearest(candidates, drawn_by(drawn[is_candidate], 1), apart, threads)]
     cell = NeighbourSearch(chosen, threads).knn(points, 1)[1][:, 0]
     count = np.bincount(cell, minlength=len(chosen)).astype(np.float64)
     filled = count > 0
@@ -163,46 +162,43 @@ class _Looking:
     def __init__(
         self, points: Tensor, sources: Tensor, count: Tensor | None, k: int, noise: float, block_points: int, threads: int
     ) -> None:
-        self.points, self.sources, self.count, self.noise, self.threads = points, sources, count, noise, threads
-        index = NeighbourSearch(sources.detach().numpy(), threads).knn(points.detach().numpy(), k)[1]
-        self.index = torch.from_numpy(index.astype(np.int32))
-        self.blocks = [slice(i, min(i + block_points, len(points))) for i in range(0, len(points), block_points)]
+        self.points, self.sources, self.count, self.noise = points, sources, count, noise
+        self.block_points, self.threads = block_points, threads
+        self.index = torch.from_numpy(NeighbourSearch(sources.detach().numpy(), threads).nearest(points.detach().numpy(), k))
         self._only: Edges | None = None
         self._only_features: tuple[Tensor, Tensor, Tensor] | None = None
 
-    def over_blocks(self, work: Callable[[slice, Edges], T]) -> list[T]:
-        """What `work` gives for each block and its edges. Blocks are spread over threads; a block's own work is done by one,
-        since threads that wait for each other after every small operation cost more than they do."""
-        if len(self.blocks) == 1:
-            if self._only is None:
-                self._only = self._edges(self.blocks[0])
-            return [work(self.blocks[0], self._only)]
-        with_gradient = torch.is_grad_enabled()  # known to this thread alone
+    def over_blocks(self, work: Callable[[slice, Edges], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
+        """What `work` gives for each block and its edges, put together."""
+        return in_blocks(lambda block: work(block, self._edges(block)), len(self.points), self.threads, self.block_points)
 
-        def one(block: slice) -> T:
-            with torch.set_grad_enabled(with_gradient):
-                return work(block, self._edges(block))
-
-        with ThreadPoolExecutor(max(1, self.threads)) as pool:
-            return list(pool.map(one, self.blocks))
+    @property
+    def in_one(self) -> bool:
+        """Whether all points are one block, whose edges are kept."""
+        return len(self.points) <= self.block_points
 
     def _edges(self, block: slice) -> Edges:
-        index = self.index[block].long()
-        return edges((self.sources[index] - self.points[block, None]).float(), index, self.count)
+        if self._only is not None:
+            return self._only
+        index = self.index[block]
+        graph = edges((at(self.sources, index) - self.points[block, None]).float(), index, self.count)
+        if self.in_one:
+            self._only = graph
+        return graph
 
     def planes(self) -> Planes:
         """Tangent planes of all points."""
-        return joined(self.over_blocks(lambda _, graph: planes(graph)))
+        return Planes(*self.over_blocks(lambda _, graph: planes(graph)))
 
     def around(self, stage: Stage) -> tuple[Planes, Tensor]:
         """Tangent planes and first features (M, C) of all points."""
 
-        def look(_: slice, graph: Edges) -> tuple[Planes, Tensor]:
+        def look(_: slice, graph: Edges) -> tuple[Tensor, ...]:
             plane = planes(graph)
-            return plane, stage.embed(point_features(graph, plane, self.noise))
+            return *plane, stage.embed(point_features(graph, plane, self.noise))
 
-        found, known = zip(*self.over_blocks(look), strict=True)
-        return joined(found), torch.cat(known)
+        normal, shape, known = self.over_blocks(look)
+        return Planes(normal, shape), known
 
     def messages(
         self, stage: Stage, own: Planes, theirs: Planes, features: Tensor, sources: Tensor, on_block: Callable[[int], None]
@@ -215,21 +211,19 @@ class _Looking:
             heard = layer.hear(features if among else sources)
             before = features
 
-            def exchange(block: slice, graph: Edges) -> tuple[Tensor, Tensor]:
+            def exchange(block: slice, graph: Edges) -> tuple[Tensor, ...]:
                 mine = own.block(block)
                 edge, a, b = self._features(graph, mine, theirs)
                 message, news = layer(edge, graph, before[block], heard)  # noqa: B023
-                step = stage.step(message, graph, mine, theirs, a, b) if last else torch.zeros(0, 3)  # noqa: B023
                 on_block(block.stop - block.start)
-                return news, step
+                return (news, stage.step(message, graph, mine, theirs, a, b)) if last else (news,)  # noqa: B023
 
-            news, moves = zip(*self.over_blocks(exchange), strict=True)
-            features = torch.cat(news)
-            move = torch.cat(moves) if last else move
+            features, *moves = self.over_blocks(exchange)
+            move = moves[0] if last else move
         return move, features
 
     def _features(self, graph: Edges, mine: Planes, theirs: Planes) -> tuple[Tensor, Tensor, Tensor]:
-        if len(self.blocks) > 1:
+        if not self.in_one:
             return edge_features(graph, mine, theirs, self.noise)
         if self._only_features is None:
             self._only_features = edge_features(graph, mine, theirs, self.noise)

@@ -1,25 +1,29 @@
-"""What is done about moves: relaxation toward even spacing, low frequencies taken back, the limit on any move.
+"""What is done about moves: relaxation toward even spacing, low frequencies taken back.
 
-Not here: moves along the normal (the network's).
+Not here: moves along the normal (the network's), the limit on any move (cloud.scan).
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+import torch
+from torch import Tensor
 
 from pcdenoise.cloud.neighbours import NeighbourSearch, pairs_within, thinned
-from pcdenoise.cloud.scan import Points
+from pcdenoise.cloud.scan import Points, within
+from pcdenoise.denoising import blocks
+from pcdenoise.networks.projection import Edges, planes, smallest_eigenvector
 
 _NEIGHBOURS = 12
 _STEP = 0.35  # of the local spacing, at most, per step
+_PUSHING = 1.6  # local spacings: who is further away does not push
 _REACH_STDS = 1.0
 """How far a point may slide in all, in standard deviations of the noise: isotropic noise has displaced it by so much along
 the surface too, so a clean cloud stays as it is."""
 _SHEET = (0.25, 0.4)
 """Planarity, (√λ₂ - √λ₁) / √λ₃ of the covariance's ascending eigenvalues, at which points begin to slide and slide in full:
 one in a hundred neighbourhoods of a surface has less than 0.4, half of those in a volume or on a wire less than 0.21."""
-_BLOCK = 65_536
+_BLOCK = 2 * blocks.BLOCK_POINTS
 _LOW_PASS_STD = 0.4 * 2**0.5  # of its radius, as released
 _LOW_PASS_POINTS = 256  # within its radius: more are thinned
 
@@ -29,40 +33,31 @@ def relax(points: Points, noise_std: float, steps: int, threads: int = -1) -> Po
 
     Each step pushes a point away from neighbours that are nearer than the local mean, inside the tangent plane of its
     neighbourhood; at the end all land on the surface again. Where that is no sheet (wires, volumes, corners) points stay, or
-    spreading them would change the shape.
+    spreading them would change the shape. Neighbours are found once: the few that push are among the twelve nearest before
+    and after, since nobody slides past them.
     """
     if len(points) <= 3 or noise_std <= 0 or steps == 0:
         return points
     k = min(_NEIGHBOURS, len(points) - 1)
-    reach = _REACH_STDS * noise_std
-    start, current = points, points.copy()
-    search = NeighbourSearch(points, threads)
-    distances, index = search.knn(points, k + 1)
-    normals, sheet, spacing = np.empty_like(points), np.empty(len(points)), distances[:, k] / np.sqrt(k / 2.5)
-    for block in _blocks(len(points)):
-        normals[block], sheet[block] = _tangents(points, index[block])
-    for step in range(steps):
-        if step == steps // 2:
-            index = NeighbourSearch(current, threads).knn(current, k + 1)[1]
-        moved = np.empty_like(current)
-        for block in _blocks(len(points)):
-            moved[block] = current[block] + sheet[block, None] * _push(current, normals, spacing, index, block)
-        current = within(reach, start, moved)
-    distances, index = search.knn(current, k)
-    landed = np.empty_like(current)
-    for block in _blocks(len(points)):
-        landed[block] = current[block] + sheet[block, None] * _height(
-            current[block], points, normals, distances[block], index[block]
-        )
-    return within(reach, start, landed)
+    distances, found = NeighbourSearch(points, threads).knn(points, k + 1)
+    index = torch.from_numpy(found.astype(np.int32))
+    spacing = torch.from_numpy(distances[:, k:] / np.sqrt(k / 2.5))
+    del distances, found
 
+    def over(work: blocks.Work) -> tuple[Tensor, ...]:
+        return blocks.in_blocks(work, len(points), threads, _BLOCK)
 
-def within(reach: float, start: Points, moved: Points) -> Points:
-    """(N, 3) moved points, but none further than `reach` from its start."""
-    slide = moved - start
-    length = np.linalg.norm(slide, axis=1, keepdims=True)
-    cut: Points = start + slide * (reach / np.maximum(length, max(reach, 1e-300)))
-    return cut
+    with blocks.torch_threads(1), torch.no_grad():
+        start = _by_axis(torch.from_numpy(points))
+        normal, sheet = over(lambda rows: _tangents(start, index[rows], rows))
+        normal = _by_axis(normal)
+        agreement = over(lambda rows: (_agreement(normal, index[rows, 1:], rows) * sheet[rows],))[0]
+        current = start
+        for _ in range(steps):
+            pushed = over(lambda rows: (_push(current, normal, agreement, spacing, index[rows, 1:], rows),))[0]  # noqa: B023
+            current = _by_axis(torch.from_numpy(within(_REACH_STDS * noise_std, points, pushed.numpy())))
+        landed = over(lambda rows: (_landed(current, start, normal, sheet, index[rows], rows),))[0]
+    return within(_REACH_STDS * noise_std, points, landed.numpy())
 
 
 def without_low_frequencies(points: Points, moves: Points, radius: float, rng: np.random.Generator) -> Points:
@@ -83,48 +78,74 @@ def without_low_frequencies(points: Points, moves: Points, radius: float, rng: n
     return left
 
 
-def _blocks(n: int) -> list[slice]:
-    return [slice(i, min(i + _BLOCK, n)) for i in range(0, n, _BLOCK)]
+def _by_axis(vectors: Tensor) -> Tensor:
+    """(N, 3) vectors that lie axis by axis in memory."""
+    return vectors.t().contiguous().t()
 
 
-def _push(points: Points, normals: Points, spacing: NDArray[np.float64], index: NDArray[np.int64], block: slice) -> Points:
-    """(M, 3) one step: repulsion in the tangent plane, faded where normals disagree."""
-    own, normal, reach = points[block], normals[block], spacing[block]
-    near = index[block, 1:]
-    away = own[:, None] - points[near]
-    distance = np.maximum(np.sqrt((away**2).sum(axis=2)), 1e-300)
-    theirs = normals[near]
-    agreement = np.einsum("mi,mki->mk", normal, theirs) ** 2
-    strength = agreement * np.maximum(1 - distance / (1.6 * reach[:, None]), 0)
-    push = np.einsum("mk,mki->mi", strength * reach[:, None] / distance, away)
-    push -= (push * normal).sum(axis=1, keepdims=True) * normal
-    length = np.linalg.norm(push, axis=1, keepdims=True)
-    step: Points = _STEP * push * (reach[:, None] / np.maximum(np.maximum(length, reach[:, None]), 1e-300))
-    return step
+def _near(vectors: Tensor, index: Tensor) -> list[Tensor]:
+    """x, y and z (M, K) of the vectors in (M, K) rows."""
+    flat = index.reshape(-1)
+    return [axis.index_select(0, flat).view(index.shape) for axis in vectors.unbind(1)]
 
 
-def _height(points: Points, start: Points, normals: Points, distances: NDArray[np.float64], index: NDArray[np.int64]) -> Points:
-    """(M, 3) moves back onto the surface through the starting points: the projection network's step with plane normals alone.
+def _dot(one: list[Tensor], other: list[Tensor]) -> Tensor:
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+
+
+def _each(vectors: Tensor, rows: slice) -> list[Tensor]:
+    """x, y and z (M, 1) of the vectors in some rows."""
+    return [axis[rows, None] for axis in vectors.unbind(1)]
+
+
+def _tangents(points: Tensor, index: Tensor, rows: slice) -> tuple[Tensor, Tensor]:
+    """(M, 3) unit normals and (M, 1) from 0, no surface (a wire, a volume), to 1, a sheet."""
+    near = _near(points, index)
+    offset = torch.stack([axis - own for axis, own in zip(near, _each(points, rows), strict=True)]).permute(1, 2, 0)
+    weight = torch.full(index.shape, 1 / index.shape[1], dtype=points.dtype)
+    plane = planes(Edges(offset, index, weight, torch.ones(len(index), 1, dtype=points.dtype)))
+    thin, middle, wide = _each(plane.shape, slice(None))
+    planarity = (middle - thin) / wide.clamp_min(1e-300)
+    return plane.normal, ((planarity - _SHEET[0]) / (_SHEET[1] - _SHEET[0])).clamp(0, 1)
+
+
+def _agreement(normal: Tensor, index: Tensor, rows: slice) -> Tensor:
+    """(M, K) squared cosines between a point's normal and its neighbours'."""
+    return _dot(_near(normal, index), _each(normal, rows)).square_()
+
+
+def _push(points: Tensor, normal: Tensor, strength: Tensor, spacing: Tensor, index: Tensor, rows: slice) -> Tensor:
+    """(M, 3) points one step further: repulsion in the tangent plane, faded where normals disagree."""
+    own, upright, reach = _each(points, rows), _each(normal, rows), spacing[rows]
+    away = [mine - theirs for mine, theirs in zip(own, _near(points, index), strict=True)]
+    distance = _dot(away, away).sqrt_().clamp_min_(1e-300)
+    weight = (distance.reciprocal() - 1 / (_PUSHING * reach)).clamp_min_(0).mul_(strength[rows])
+    push = [reach * (weight * axis).sum(1, keepdim=True) for axis in away]
+    height = _dot(push, upright)
+    push = [axis - height * up for axis, up in zip(push, upright, strict=True)]
+    step = _STEP * reach / torch.maximum(_dot(push, push).sqrt_(), reach).clamp_min_(1e-300)
+    return torch.cat([at + step * axis for at, axis in zip(own, push, strict=True)], dim=1)
+
+
+def _landed(points: Tensor, start: Tensor, normal: Tensor, sheet: Tensor, index: Tensor, rows: slice) -> Tensor:
+    """(M, 3) points back on the surface through the starting points: the projection network's step with plane normals alone.
 
     A slide along a tangent plane leaves a curved surface by κt²/2. The mean height of the neighbours over the own plane and
     the mean depth under their planes err by that much to either side, so that their half sum meets the surface.
     """
-    weight = np.maximum(1 - (distances / np.maximum(distances[:, -1:], 1e-300)) ** 2, 0) ** 2 + 1e-12
-    weight /= weight.sum(axis=1, keepdims=True)
-    theirs, offset = normals[index], start[index] - points[:, None]
-    own = np.linalg.eigh(np.einsum("mk,mki,mkj->mij", weight, theirs, theirs))[1][:, :, 2]
-    depth = (offset * theirs).sum(axis=2)
-    under = np.einsum("mk,mki->mi", weight * depth, theirs)
-    over = (weight * (offset @ own[:, :, None])[:, :, 0]).sum(axis=1, keepdims=True) * own
-    move: Points = 0.5 * (under + over)
-    return move
-
-
-def _tangents(points: Points, index: NDArray[np.int64]) -> tuple[Points, NDArray[np.float64]]:
-    """(M, 3) unit normals and (M,) from 0, no surface (a wire, a volume), to 1, a sheet."""
-    near = points[index] - points[index[:, 0], None]
-    near -= near.mean(axis=1, keepdims=True)
-    eigenvalues, frames = np.linalg.eigh(near.transpose(0, 2, 1) @ near)
-    thin, middle, wide = np.sqrt(np.maximum(eigenvalues, 0)).T
-    planarity = (middle - thin) / np.maximum(wide, 1e-300)
-    return frames[:, :, 0], np.clip((planarity - _SHEET[0]) / (_SHEET[1] - _SHEET[0]), 0, 1)
+    own, theirs = _each(points, rows), _near(normal, index)
+    offset = [there - mine for there, mine in zip(_near(start, index), own, strict=True)]
+    squared = _dot(offset, offset)
+    weight = (1 - squared / squared.amax(1, keepdim=True).clamp_min(1e-300)).square_().add_(1e-12)
+    weight /= weight.sum(1, keepdim=True)
+    tilted = [weight * axis for axis in theirs]
+    spread = {(i, j): (tilted[i] * theirs[j]).sum(1) for i in range(3) for j in range(i, 3)}
+    matrix = torch.stack([spread[min(i, j), max(i, j)] for i in range(3) for j in range(3)], dim=1).view(-1, 3, 3)
+    upright = _each(smallest_eigenvector(-matrix)[1], slice(None))
+    over = (weight * _dot(offset, upright)).sum(1, keepdim=True)
+    depth = _dot(offset, theirs)
+    share = 0.5 * sheet[rows]
+    moved = [
+        at + share * ((axis * depth).sum(1, keepdim=True) + over * up) for at, axis, up in zip(own, tilted, upright, strict=True)
+    ]
+    return torch.cat(moved, dim=1)

@@ -6,11 +6,12 @@ What was read is written back as it was but for the coordinates that moved: `Sca
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 
@@ -84,6 +85,62 @@ def write(
             _encode(scan, file, named, Path(target).suffix.lower(), provenance)
         except ScanError as fault:
             raise ScanError(f"{target}: {fault}") from None
+
+
+class Stream(Protocol):
+    """A file that is read and written in pieces, so that it need not fit in memory; each piece is a scan of some of its rows."""
+
+    n_points: int
+    format: str
+
+    def pieces(self, n_rows: int) -> Iterator[Scan]:
+        """Scans of at most n_rows rows, in file order. Raises ScanError on damage."""
+
+    def write(self, pieces: Iterable[Scan], file: BinaryIO, *, format: str, provenance: Mapping[str, Any] | None) -> None:
+        """Write the pieces, moved or with further columns, as `io.write` would write the whole scan."""
+
+
+@contextmanager
+def streamed(path: str | os.PathLike[str], *, format: str | None = None) -> Iterator[Stream | None]:
+    """A file as a stream, or None where it has to be read whole: stdin, PCD, KITTI, PLY as text or with lists.
+
+    Raises ScanError as `read` does, for what shows without reading the points.
+    """
+    named = None if os.fspath(path) == files.STREAM or not Path(path).is_file() else _known(format or _by_suffix(path))
+    if named not in ("las", "laz", "ply", "xyz") or not Path(path).stat().st_size:
+        yield None
+        return
+    with files.mapped(path) as raw:
+        origin, found = os.fspath(path), _sniffed(raw[:_HEAD])
+        if not found or _MODULES[found] is not _MODULES[named]:
+            yield None  # `read` says what is wrong
+        elif found == "xyz":
+            yield xyz.XyzStream.of(raw, origin)
+        else:
+            yield ply.PlyStream.of(raw, origin) if found == "ply" else las.LasStream(raw, origin)
+
+
+def write_streamed(
+    stream: Stream,
+    pieces: Iterable[Scan],
+    path: str | os.PathLike[str],
+    *,
+    format: str | None = None,
+    overwrite: bool = False,
+    provenance: Mapping[str, Any] | None = None,
+) -> None:
+    """Write the pieces of a stream to a file, whole or not at all; LAS as LAS or LAZ, else as the format it has."""
+    target = os.fspath(path)
+    with files.written(path, overwrite=overwrite) as file:
+        try:
+            stream.write(pieces, file, format=_known(format or _by_suffix(path)), provenance=provenance)
+        except ScanError as fault:
+            raise ScanError(f"{target}: {fault}") from None
+
+
+def same_kind(one: str, other: str) -> bool:
+    """Whether two formats hold the same, as LAS and LAZ do."""
+    return _MODULES[one] is _MODULES[other]
 
 
 def losses(scan: Scan, format: str) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import shutil
 import stat
@@ -15,6 +16,8 @@ from typing import BinaryIO
 from pcdenoise.errors import ScanError
 from pcdenoise.whole_files import replaced
 
+Raw = bytes | mmap.mmap
+"""The bytes of a file, read or mapped."""
 STREAM = "-"
 """The path that means stdin or stdout."""
 
@@ -63,6 +66,23 @@ def _stream_bytes(stream: BinaryIO, origin: str) -> bytes:
     except MemoryError:
         pass
     raise ScanError(f"{origin}: brings more than memory holds; save it as a file and split it into tiles")
+
+
+@contextmanager
+def mapped(path: str | os.PathLike[str]) -> Iterator[mmap.mmap]:
+    """The bytes of a file that is not empty, read only where they are looked at. Raises ScanError if it cannot be read."""
+    try:
+        with open(path, "rb") as file:
+            raw = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except OSError as fault:
+        raise ScanError(f"{path}: cannot be read ({fault.strerror}); check its permissions and the disk") from None
+    yield raw  # closed with its last view: numpy may hold some for a while
+
+
+def let_go(raw: Raw) -> None:
+    """Takes the pages of a mapped file that were looked at out of memory; they are read again when looked at again."""
+    if isinstance(raw, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+        raw.madvise(mmap.MADV_DONTNEED)
 
 
 @contextmanager

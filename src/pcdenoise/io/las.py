@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -15,6 +16,7 @@ from pcdenoise.cloud.scan import Mask, Points, Scan
 from pcdenoise.errors import ScanError
 from pcdenoise.io import crs, las_file
 from pcdenoise.io.crs import Crs
+from pcdenoise.io.files import Raw
 from pcdenoise.io.las_dimensions import EXTRA_BYTES, Dimension, extended, reduced, structured
 from pcdenoise.io.las_file import HEADER, LasFile
 from pcdenoise.io.source import Column, changed, colours_as_words, portable, step_decimals, storable
@@ -130,8 +132,51 @@ def unstorable(columns: Mapping[str, Column]) -> list[str]:
     return [name for name, values in columns.items() if storable(values) is None or len(name.encode()) > 32]
 
 
+class LasStream:
+    """A LAS or LAZ file read and written in pieces; each piece is a scan of some of its rows."""
+
+    def __init__(self, raw: Raw, origin: str) -> None:
+        self.file, self.body = las_file.outline(raw, origin)
+        self.file, self.origin, self.n_points = self.file.without_copc(), origin, self.body.n_points
+        self.format = "las" if self.body.layout is None else "laz"
+
+    def pieces(self, n_rows: int) -> Iterator[Scan]:
+        """Scans of at most n_rows rows, in order. Raises ScanError on damage."""
+        for records in self.body.parts(n_rows):
+            source = LasSource.of(replace(self.file, records=records))
+            yield Scan(source.points(), source.columns, self.format, self.origin, source)
+
+    def write(self, pieces: Iterable[Scan], file: BinaryIO, *, format: str, provenance: Mapping[str, Any] | None = None) -> None:
+        """Write pieces of this stream, moved or with further columns, as `write` would write the whole."""
+        bounds = np.array([[-np.inf] * 3, [np.inf] * 3])
+        is_moved = False
+
+        def records_of(target: LasFile, moved: bool) -> NDArray[np.uint8]:
+            nonlocal is_moved
+            points = _coordinates(target, structured(target)[0])
+            bounds[0], bounds[1] = np.maximum(bounds[0], points.max(axis=0)), np.minimum(bounds[1], points.min(axis=0))
+            is_moved |= moved
+            return target.records
+
+        remaining = (_target(piece, provenance) for piece in pieces)
+        first = next(remaining, None)
+        if first is None:
+            first = _target(Scan(np.empty((0, 3)), source=LasSource.of(self.file)), provenance)
+        first[0].write(
+            file,
+            compressed=format == "laz",
+            parts=(records_of(target, moved) for target, moved in chain([first], remaining) if len(target.records)),
+            at_the_end=lambda: {"bounds": bounds.T} if is_moved else {},
+        )
+
+
 def write(scan: Scan, file: BinaryIO, *, compressed: bool, provenance: Mapping[str, Any] | None = None) -> None:
     """Write a scan as LAS or LAZ: unmoved coordinates keep their integers. Raises ScanError if a value does not fit."""
+    _target(scan, provenance)[0].write(file, compressed=compressed)
+
+
+def _target(scan: Scan, provenance: Mapping[str, Any] | None) -> tuple[LasFile, bool]:
+    """The file that holds a scan, and whether any of its points moved."""
     own = scan.source if isinstance(scan.source, LasSource) else None
     source = own or _created(scan)
     columns = changed(scan) if own else _by_dimension(colours_as_words(portable(scan.attributes)), source)
@@ -145,7 +190,8 @@ def write(scan: Scan, file: BinaryIO, *, compressed: bool, provenance: Mapping[s
     records, _ = structured(target)
     for name, values in standing.items():
         source.dimensions[name].put(records, values)
-    if _move(target, records, scan.points):
+    is_moved = _move(target, records, scan.points)
+    if is_moved:
         target = _bounded(target)
     if own is None:
         target = _counted(target)
@@ -155,7 +201,7 @@ def write(scan: Scan, file: BinaryIO, *, compressed: bool, provenance: Mapping[s
         target = target.with_header(software=f"pcdenoise {__version__}".encode())
     elif own is not None and own.header:
         target = target.with_header(**own.header)
-    target.write(file, compressed=compressed)
+    return target, is_moved
 
 
 def _header_before(source: LasSource | None) -> dict[str, Any]:

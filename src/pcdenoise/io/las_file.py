@@ -7,6 +7,7 @@ bytes. Layouts follow the ASPRS LAS 1.4 R15 specification.
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, BinaryIO
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from pcdenoise.errors import ScanError
 from pcdenoise.io import laz
+from pcdenoise.io.files import Raw, let_go
 
 HEADER = np.dtype(
     [
@@ -120,8 +122,19 @@ class LasFile:
             at = end
         return records
 
-    def write(self, file: BinaryIO, *, compressed: bool) -> None:
-        """Write as LAS or LAZ at the start of a seekable file. Raises ScanError if lazrs cannot hold the records exactly."""
+    def write(
+        self,
+        file: BinaryIO,
+        *,
+        compressed: bool,
+        parts: Iterable[NDArray[np.uint8]] | None = None,
+        at_the_end: Callable[[], Mapping[str, Any]] = dict,
+    ) -> None:
+        """Write as LAS or LAZ at the start of a seekable file. Raises ScanError if lazrs cannot hold the records exactly.
+
+        parts: the records in several pieces, in place of `records`; at_the_end: header fields that are known after the last.
+        """
+        parts = (self.records,) if parts is None else parts
         vlrs = [record for record in self.vlrs if compressed or vlr_identity(record) != LASZIP]
         n_extra = self.records.shape[1] - standard_length(self.point_format)
         layout = laz.layout(self.point_format, n_extra, self.vlr(*LASZIP))
@@ -138,9 +151,11 @@ class LasFile:
         )
         file.write(start.header + b"".join(vlrs) + self.gap)
         if compressed:
-            laz.compress(self.records, layout, file, check=self.point_format in _WAVEFORM_14)
+            laz.compress(parts, layout, file, check=self.point_format in _WAVEFORM_14)
         else:
-            file.write(self.records.data)
+            for records in parts:
+                file.write(records.data)
+        start = start.with_header(**at_the_end())
         shift = file.tell() - self.tail_start
         file.write(self.tail)
         file.seek(0)
@@ -149,8 +164,37 @@ class LasFile:
         file.seek(0, 2)
 
 
+@dataclass(frozen=True)
+class Body:
+    """Where the point records of a file are: n_points of `length` bytes from byte `start`; layout: how they are compressed."""
+
+    raw: Raw
+    origin: str
+    start: int
+    n_points: int
+    length: int
+    layout: bytes | None
+
+    def parts(self, n_rows: int) -> Iterator[NDArray[np.uint8]]:
+        """(at most n_rows, length) records after records. Raises ScanError if compressed ones are damaged."""
+        if self.layout is not None:
+            yield from laz.decompressed(self.raw, self.start, self.n_points, self.length, self.layout, self.origin, n_rows)
+            return
+        for first in range(0, self.n_points, n_rows):
+            n = min(n_rows, self.n_points - first)
+            octets = np.frombuffer(self.raw, np.uint8, n * self.length, self.start + first * self.length)
+            yield octets.reshape(n, self.length)
+            let_go(self.raw)
+
+
 def parse(raw: bytes, origin: str) -> LasFile:
     """Take a LAS or LAZ file apart. Raises ScanError if it is not LAS, is damaged or holds fewer points than it claims."""
+    file, body = outline(raw, origin)
+    return replace(file, records=next(body.parts(max(1, body.n_points)), file.records))
+
+
+def outline(raw: Raw, origin: str) -> tuple[LasFile, Body]:
+    """The file without its records, and where they are. Raises ScanError as `parse` does, for what shows without reading them."""
     if len(raw) < 227 or raw[:4] != b"LASF":
         raise ScanError(f"{origin}: is not a LAS file (no LASF header); check the file or name its real format")
     fields = np.frombuffer(raw[: HEADER.itemsize].ljust(HEADER.itemsize, b"\0"), HEADER, 1)[0]
@@ -184,14 +228,15 @@ def parse(raw: bytes, origin: str) -> LasFile:
         layouts = [record[_VLR.size :] for record in vlrs if vlr_identity(record) == LASZIP]
         if not layouts:
             raise ScanError(f"{origin}: is compressed but has no laszip VLR; the file is damaged, fetch it again")
-        records = laz.decompress(raw, points_start, n_points, length, layouts[0], origin)
+        layout = layouts[0]
     else:
         held = (len(raw) - points_start) // length
         if n_points > held:
             raise ScanError(f"{origin}: header claims {n_points} points, the file holds {held}; it is cut off, fetch it again")
         tail_start = points_start + n_points * length
-        records = np.frombuffer(raw, np.uint8, n_points * length, points_start).reshape(n_points, length)
-    return LasFile(raw[:size], vlrs, gap, records, raw[tail_start:], tail_start)
+        layout = None
+    file = LasFile(raw[:size], vlrs, gap, np.empty((0, length), np.uint8), raw[tail_start:], tail_start)
+    return file, Body(raw, origin, points_start, n_points, length, layout)
 
 
 def vlr_identity(record: bytes) -> tuple[bytes, int]:

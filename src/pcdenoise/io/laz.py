@@ -6,15 +6,18 @@ A layout is the payload of the laszip VLR: compressor, chunk size, and the items
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
-from io import BytesIO
-from typing import BinaryIO
+from collections.abc import Iterable, Iterator, Sequence
+from hashlib import sha256
+from io import BytesIO, RawIOBase
+from mmap import mmap
+from typing import Any, BinaryIO
 
 import lazrs
 import numpy as np
 from numpy.typing import NDArray
 
 from pcdenoise.errors import ScanError
+from pcdenoise.io.files import Raw
 
 _ITEMS = 32  # where a layout counts its items
 _LAYERED = 3
@@ -23,10 +26,15 @@ _LARGEST_CHUNK = 64 << 20
 _LARGEST_RATIO = 5_000  # points all alike compress 3000 to 1 in chunks of 50000
 
 
-def decompress(raw: bytes, start: int, n_points: int, length: int, layout: bytes, origin: str) -> NDArray[np.uint8]:
-    """(n_points, length) records of the point stream at byte `start`. Raises ScanError if it is damaged or holds fewer."""
+def decompressed(
+    raw: Raw, start: int, n_points: int, length: int, layout: bytes, origin: str, n_rows: int
+) -> Iterator[NDArray[np.uint8]]:
+    """(at most n_rows, length) records after records of the point stream at byte `start`, n_points in all.
+
+    Raises ScanError if it is damaged or holds fewer.
+    """
     if n_points == 0:
-        return np.empty((0, length), np.uint8)
+        return
     try:
         item_length = lazrs.LazVlr(layout).item_size()
         if item_length != length:
@@ -38,12 +46,14 @@ def decompress(raw: bytes, start: int, n_points: int, length: int, layout: bytes
             raise ScanError(
                 f"{origin}: header claims {n_points} points, the compressed data holds at most {held}; fetch it again"
             )
-        records = np.empty((n_points, length), np.uint8)
-        source = BytesIO(raw)
+        source = BytesIO(raw) if isinstance(raw, bytes) else _MappedFile(raw)
         source.seek(start)
         in_parallel = chunks and max(n for n, _ in chunks) * length <= _LARGEST_CHUNK  # lazrs makes room for whole chunks
-        decompressor = lazrs.ParLasZipDecompressor if in_parallel else lazrs.LasZipDecompressor
-        decompressor(source, layout).decompress_many(records.reshape(-1))
+        decompressor = (lazrs.ParLasZipDecompressor if in_parallel else lazrs.LasZipDecompressor)(source, layout)
+        for first in range(0, n_points, n_rows):
+            records = np.empty((min(n_rows, n_points - first), length), np.uint8)
+            decompressor.decompress_many(records.reshape(-1))
+            yield records
     except MemoryError:
         raise ScanError(f"{origin}: header claims {n_points} points, more than memory holds; split it into tiles first") from None
     except lazrs.LazrsError as fault:
@@ -52,10 +62,35 @@ def decompress(raw: bytes, start: int, n_points: int, length: int, layout: bytes
         if type(fault).__name__ != "PanicException":  # how a Rust panic arrives: no Exception, no importable class
             raise
         raise ScanError(f"{origin}: the compressed points are damaged; fetch the file again") from None
-    return records
 
 
-def _chunk_table(raw: bytes, start: int, layout: bytes) -> list[tuple[int, int]]:
+class _MappedFile(RawIOBase):
+    """A mapped file as a stream of its own place, since several may read it at once."""
+
+    def __init__(self, raw: mmap) -> None:
+        self.raw, self.at = raw, 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        self.at = offset + (0, self.at, len(self.raw))[whence]
+        return self.at
+
+    def tell(self) -> int:
+        return self.at
+
+    def readinto(self, buffer: Any) -> int:
+        piece = self.raw[self.at : self.at + len(buffer)]
+        buffer[: len(piece)] = piece
+        self.at += len(piece)
+        return len(piece)
+
+
+def _chunk_table(raw: Raw, start: int, layout: bytes) -> list[tuple[int, int]]:
     """(points, bytes) of each compressed chunk; empty if the stream has no table. Raises LazrsError on sizes that cannot be true.
 
     Checked here because lazrs allocates what the file says, and an allocation that fails ends the process.
@@ -81,7 +116,7 @@ def _chunk_table(raw: bytes, start: int, layout: bytes) -> list[tuple[int, int]]
     return chunks
 
 
-def _check_layers(raw: bytes, at: int, chunks: list[tuple[int, int]], layout: bytes) -> None:
+def _check_layers(raw: Raw, at: int, chunks: list[tuple[int, int]], layout: bytes) -> None:
     """Raises LazrsError if a layered chunk (a point, a count, each layer's size, the layers) claims more bytes than it has."""
     items = [struct.unpack_from("<HH", layout, _ITEMS + 2 + 6 * i) for i in range(struct.unpack_from("<H", layout, _ITEMS)[0])]
     n_layers = sum(_N_LAYERS.get(kind, size) for kind, size in items)
@@ -103,22 +138,32 @@ def layout(point_format: int, n_extra: int, present: Sequence[bytes]) -> bytes:
     return default
 
 
-def compress(records: NDArray[np.uint8], layout: bytes, file: BinaryIO, *, check: bool) -> None:
-    """Write (N, length) records as a point stream at the file's position; `check` raises ScanError if it reads back otherwise.
+def compress(parts: Iterable[NDArray[np.uint8]], layout: bytes, file: BinaryIO, *, check: bool) -> None:
+    """Write (n, length) records after records as one point stream at the file's position.
 
-    lazrs 0.8 scrambles waveform fields of formats 9 and 10 when scanner channels alternate.
+    check: raise ScanError if it reads back otherwise; lazrs 0.8 scrambles waveform fields of formats 9 and 10 when scanner
+    channels alternate.
     """
     start = file.tell()
     compressor = lazrs.ParLasZipCompressor(file, lazrs.LazVlr(layout))
-    block = max(1, _LARGEST_CHUNK // records.shape[1])
-    for first in range(0, len(records), block):
-        compressor.compress_many(np.ascontiguousarray(records[first : first + block]).reshape(-1))
+    written: list[tuple[int, bytes]] = []
+    for records in parts:
+        block = max(1, _LARGEST_CHUNK // records.shape[1])
+        for first in range(0, len(records), block):
+            octets = np.ascontiguousarray(records[first : first + block]).reshape(-1)
+            compressor.compress_many(octets)
+            if check:
+                written.append((len(octets), sha256(octets.tobytes()).digest()))
     compressor.done()
-    if check and len(records):
+    if written:
         end = file.tell()
         file.seek(start)
-        back = np.empty_like(records)
-        lazrs.ParLasZipDecompressor(file, layout).decompress_many(back.reshape(-1))
+        decompressor = lazrs.ParLasZipDecompressor(file, layout)
+        same = True
+        for size, digest in written:
+            back = np.empty(size, np.uint8)
+            decompressor.decompress_many(back)
+            same &= sha256(back.tobytes()).digest() == digest
         file.seek(end)
-        if not np.array_equal(back, records):
+        if not same:
             raise ScanError("LAZ cannot hold these waveform packets exactly (several scanner channels); write .las instead")

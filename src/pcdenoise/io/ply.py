@@ -6,8 +6,8 @@ Bodies are read without plyfile, which takes seconds for a million rows of text 
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -16,6 +16,7 @@ from plyfile import PlyData, PlyElement
 from pcdenoise.cloud.scan import Mask, Points, Scan
 from pcdenoise.errors import ScanError
 from pcdenoise.io import ply_header
+from pcdenoise.io.files import Raw, let_go
 from pcdenoise.io.lines import find_lines, first_visible
 from pcdenoise.io.ply_header import TYPES, Element, Header
 from pcdenoise.io.records import FixedRecords, ListRecords, Records, TextRecords
@@ -74,17 +75,68 @@ def matches(head: bytes) -> bool:
 
 def read(raw: bytes, origin: str) -> Scan:
     """A scan of the vertex element; its properties beside x, y, z (not lists) are the attributes. Raises ScanError on damage."""
+    header, axes, single = _outline(raw, origin)
+    parts = _text_body if header.byte_order == "=" else _binary_body
+    before, records, after = parts(raw, header, axes, origin)
+    columns = {name: _native(records.column(name)) for name in single if name not in axes}
+    return Scan(records.points(), columns, "ply", origin, PlySource(header, before, records, after, columns, origin))
+
+
+def _native(values: Column) -> Column:
+    return values.astype(values.dtype.newbyteorder("="), copy=False)
+
+
+def _outline(raw: Raw, origin: str) -> tuple[Header, tuple[str, str, str], list[str]]:
+    """Header, names of the coordinates and of all single properties. Raises ScanError without vertices or coordinates."""
     header = ply_header.parse(raw, origin)
     single = [prop.name for prop in header.vertex.properties if prop.length is None]
     lowered = [name.lower() for name in single]
     if not {"x", "y", "z"} <= set(lowered):
         raise ScanError(f"{origin}: vertices have no x, y and z (but {', '.join(single) or 'nothing'}); rename the properties")
     x, y, z = (single[lowered.index(axis)] for axis in "xyz")
-    parts = _text_body if header.byte_order == "=" else _binary_body
-    before, records, after = parts(raw, header, (x, y, z), origin)
-    stored = {name: records.column(name) for name in single if name not in (x, y, z)}
-    columns = {name: values.astype(values.dtype.newbyteorder("="), copy=False) for name, values in stored.items()}
-    return Scan(records.points(), columns, "ply", origin, PlySource(header, before, records, after, columns, origin))
+    return header, (x, y, z), single
+
+
+class PlyStream:
+    """A binary PLY file, its vertices all of one size, read and written in pieces; each piece is a scan of some of its rows."""
+
+    def __init__(self, raw: Raw, source: PlySource, records: FixedRecords, axes: tuple[str, str, str]) -> None:
+        self.raw, self.source, self.records, self.axes = raw, source, records, axes
+        self.origin, self.format, self.n_points = source.origin, "ply", len(records.array)
+
+    @classmethod
+    def of(cls, raw: Raw, origin: str) -> PlyStream | None:
+        """The stream of a file, or None where rows differ in size. Raises ScanError on damage."""
+        header, axes, _ = _outline(raw, origin)
+        if header.byte_order == "=" or any(prop.length is not None for prop in header.vertex.properties):
+            return None
+        before, records, after = _binary_body(raw, header, axes, origin)
+        assert isinstance(records, FixedRecords)
+        return cls(raw, PlySource(header, before, records, after, {}, origin), records, axes)
+
+    def pieces(self, n_rows: int) -> Iterator[Scan]:
+        """Scans of at most n_rows rows, in order."""
+        names = [name for name in self.records.array.dtype.names or () if name not in self.axes]
+        for first in range(0, self.n_points, n_rows):
+            records = FixedRecords(self.records.array[first : first + n_rows].copy(), self.axes)
+            columns = {name: _native(records.column(name)) for name in names}
+            source = replace(self.source, records=records, columns=columns)
+            yield Scan(records.points(), columns, "ply", self.origin, source)
+            let_go(self.raw)
+
+    def write(self, pieces: Iterable[Scan], file: BinaryIO, *, format: str, provenance: Mapping[str, Any] | None = None) -> None:
+        """Write pieces of this stream, moved or with further columns, as `write` would write the whole."""
+        is_first = True
+        for piece in pieces:
+            head, body = _encoded(piece, provenance)
+            if is_first:
+                file.write(head)
+            for octets in body:
+                file.write(octets)
+            is_first = False
+        if is_first:
+            file.write(self.source.header.raw + self.source.before)
+        file.write(self.source.after)
 
 
 def unstorable(columns: Mapping[str, Column]) -> list[str]:
@@ -97,6 +149,15 @@ def write(scan: Scan, file: BinaryIO, *, provenance: Mapping[str, Any] | None = 
 
     A new file stores coordinates as float if that loses nothing, else as double.
     """
+    head, body = _encoded(scan, provenance)
+    file.write(head)
+    for piece in body:
+        file.write(piece)
+    file.write(scan.source.after if isinstance(scan.source, PlySource) else b"")
+
+
+def _encoded(scan: Scan, provenance: Mapping[str, Any] | None) -> tuple[bytes, Iterator[bytes]]:
+    """The bytes before the vertices of a scan's file, and those of the vertices."""
     if isinstance(scan.source, PlySource):
         source, columns = scan.source, changed(scan)
     else:
@@ -111,10 +172,7 @@ def write(scan: Scan, file: BinaryIO, *, provenance: Mapping[str, Any] | None = 
     header = source.header.with_properties({name: values.dtype for name, values in added.items()})
     if provenance is not None:
         header = ply_header.with_provenance(header, json.dumps(provenance))
-    file.write(header + source.before)
-    for piece in source.records.rewritten(scan.points, changes, added):
-        file.write(piece)
-    file.write(source.after)
+    return header + source.before, source.records.rewritten(scan.points, changes, added)
 
 
 def _stored(values: Column) -> Column | None:
@@ -171,7 +229,7 @@ def _text_body(raw: bytes, header: Header, axes: tuple[str, str, str], origin: s
     return octets[:begin].tobytes(), TextRecords(rows, fields, axes), octets[stop:].tobytes()
 
 
-def _binary_body(raw: bytes, header: Header, axes: tuple[str, str, str], origin: str) -> tuple[bytes, Records, bytes]:
+def _binary_body(raw: Raw, header: Header, axes: tuple[str, str, str], origin: str) -> tuple[bytes, Records, bytes]:
     """Bytes before, records and bytes after the vertices of a binary file."""
     begin = stop = at = len(header.raw)
     records: Records | None = None
@@ -191,7 +249,7 @@ def _binary_body(raw: bytes, header: Header, axes: tuple[str, str, str], origin:
     return raw[len(header.raw) : begin], records, raw[stop:]
 
 
-def _binary_records(raw: bytes, at: int, element: Element, axes: tuple[str, str, str], origin: str) -> tuple[Records, int]:
+def _binary_records(raw: Raw, at: int, element: Element, axes: tuple[str, str, str], origin: str) -> tuple[Records, int]:
     """The records of an element that starts at a byte, and where it ends; of one size if its lists are all of one length."""
     fields: list[Any] = []
     end = at
@@ -213,7 +271,7 @@ def _binary_records(raw: bytes, at: int, element: Element, axes: tuple[str, str,
     return _walked(raw, at, element, axes, origin)
 
 
-def _walked(raw: bytes, at: int, element: Element, axes: tuple[str, str, str], origin: str) -> tuple[Records, int]:
+def _walked(raw: Raw, at: int, element: Element, axes: tuple[str, str, str], origin: str) -> tuple[Records, int]:
     """The records of an element whose lists change in length, row after row."""
     begin = at
     single = [prop.name for prop in element.properties if prop.length is None]
@@ -233,7 +291,7 @@ def _walked(raw: bytes, at: int, element: Element, axes: tuple[str, str, str], o
     return ListRecords(np.frombuffer(raw, np.uint8)[begin:at], ends, offsets, dtypes, axes), at
 
 
-def _list_length(raw: bytes, at: int, dtype: np.dtype[Any], element: Element, origin: str) -> int:
+def _list_length(raw: Raw, at: int, dtype: np.dtype[Any], element: Element, origin: str) -> int:
     """A list's length at a byte. Raises ScanError if it is negative or beyond the file."""
     if at + dtype.itemsize <= len(raw):
         n = int(np.frombuffer(raw, dtype, 1, at)[0])

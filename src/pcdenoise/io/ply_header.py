@@ -12,6 +12,7 @@ import numpy as np
 from plyfile import PlyData, PlyListProperty, PlyParseError
 
 from pcdenoise.errors import ScanError
+from pcdenoise.io.files import Raw
 
 TYPES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
 """numpy number types and PLY's names for them."""
@@ -104,7 +105,7 @@ def with_provenance(header: bytes, text: str) -> bytes:
     return b"".join([*lines[:-1], b"comment pcdenoise " + text.encode("ascii") + eol, lines[-1]])
 
 
-def parse(raw: bytes, origin: str) -> Header:
+def parse(raw: Raw, origin: str) -> Header:
     """The header at the start of a PLY file. Raises ScanError if it has none, breaks the grammar or has no vertices."""
     first_line = re.match(rb"ply[ \t]*(\r\n|\n|\r)", raw)
     if first_line is None:

@@ -270,12 +270,16 @@ def coordinates(rows: TextRows, column: ColumnIndex, before: Points, after: Colu
     """
     if (short := _fewest_decimals(after[moved])) is not None:
         return NewFields(after, f"%.{short}f", column, moved)
+    return NewFields(after, coordinate_form(before, *rows.decimals(column)), column, moved)
+
+
+def coordinate_form(before: Points, digits: int, exponent: bool) -> str:
+    """The printf format of `coordinates`, for (N, 3) points of the extent and size of all and a column's decimals."""
     needed = step_decimals(before, _COORDINATE_STEP)
-    digits, exponent = rows.decimals(column)
     if exponent:
         size = float(np.abs(before[np.isfinite(before)]).max(initial=1.0))
-        return NewFields(after, f"%.{min(max(digits, needed + int(np.ceil(np.log10(size)))), 17)}e", column, moved)
-    return NewFields(after, f"%.{min(max(digits, needed), 17)}f", column, moved)
+        return f"%.{min(max(digits, needed + int(np.ceil(np.log10(size)))), 17)}e"
+    return f"%.{min(max(digits, needed), 17)}f"
 
 
 def _fewest_decimals(values: Column) -> int | None:

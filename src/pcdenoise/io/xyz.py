@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from pcdenoise.cloud.scan import Mask, Points, Scan
 from pcdenoise.errors import ScanError
-from pcdenoise.io.lines import Offsets, find_lines, first_visible, is_number, split_fields
+from pcdenoise.io.files import Raw, let_go
+from pcdenoise.io.lines import Octets, Offsets, find_lines, first_visible, is_number, split_fields
 from pcdenoise.io.source import Column, changed, colours_as_bytes, exactly, moved_rows, portable, step_decimals
 from pcdenoise.io.source import is_number as holds_numbers
-from pcdenoise.io.text import NewFields, TextRows, coordinates, plain
+from pcdenoise.io.text import NewFields, TextRows, coordinate_form, coordinates, plain
 
 _DELIMITERS = (ord(";"), ord(","), ord("\t"), None)
 _COMMENTS = (b"#", b"//")
@@ -24,6 +25,7 @@ _NEW_FILE_STEP = 1e-9
 _MOST_TITLES = 1000
 _MOST_COLUMNS = 4096
 _LONGEST_LINE = 1 << 17
+_STREAM_HEAD = 4 << 20
 
 
 @dataclass(frozen=True)
@@ -96,27 +98,111 @@ def read(raw: bytes, origin: str) -> Scan:
         raise ScanError(f"{origin}: is binary or UTF-16, not text; name its real format or save it as UTF-8")
     octets = np.frombuffer(raw, np.uint8)
     starts, ends = find_lines(octets)
+    layout = _Layout.of(raw, first_visible(octets, starts, ends), ends, origin)
+    body_start = int(starts[layout.first_row])
+    rows = _rows(octets[body_start:], layout, origin, layout.first_row + 1)
+    if layout.n_claimed > len(rows):
+        raise ScanError(f"{origin}: its count line claims {layout.n_claimed} points, the file holds {len(rows)}; fetch it again")
+    axes, names = _named(rows, layout, origin)
+    points, columns = _columns(rows, axes, names)
+    indices = {name: names.index(name) for name in columns}
+    source = XyzSource(raw[:body_start], rows, axes, points, columns, indices, layout.names_end, layout.count)
+    return Scan(points, columns, "xyz", origin, source)
+
+
+def _rows(octets: Octets, layout: _Layout, origin: str, first_line: int) -> TextRows:
+    """The rows among lines that are whole: neither blank nor comments."""
+    starts, ends = find_lines(octets)
     visible = first_visible(octets, starts, ends)
-    layout = _Layout.of(raw, visible, ends, origin)
     first = octets.take(visible, mode="clip") if len(octets) else octets
     second = octets.take(visible + 1, mode="clip") if len(octets) else octets
     is_row = (visible < ends) & (first != ord("#")) & ~((first == ord("/")) & (second == ord("/")))
-    is_row[: layout.first_row] = False
-    body_start = int(starts[layout.first_row])
-    row_starts, row_ends = starts[is_row] - body_start, ends[is_row] - body_start
-    rows = TextRows(octets[body_start:], row_starts, row_ends, layout.delimiter, origin, layout.first_row + 1)
-    if layout.n_claimed > len(rows):
-        raise ScanError(f"{origin}: its count line claims {layout.n_claimed} points, the file holds {len(rows)}; fetch it again")
+    return TextRows(octets, starts[is_row], ends[is_row], layout.delimiter, origin, first_line)
+
+
+def _named(rows: TextRows, layout: _Layout, origin: str) -> tuple[tuple[int, int, int], list[str]]:
+    """Where x, y and z stand, and the names of all columns."""
     n_fields = len(rows.first_fields())
     if n_fields > _MOST_COLUMNS:
         raise ScanError(f"{origin}: line {layout.first_row + 1} has {n_fields} columns, more than any scan; is it a point cloud?")
     names = _unique([*layout.names, *(f"column_{i + 1}" for i in range(len(layout.names), n_fields))][:n_fields])
     found = [_axis(name) for name in names]
-    axes = (found.index("x"), found.index("y"), found.index("z")) if {"x", "y", "z"} <= set(found) else (0, 1, 2)
-    points, columns = _columns(rows, axes, names)
-    indices = {name: names.index(name) for name in columns}
-    source = XyzSource(raw[:body_start], rows, axes, points, columns, indices, layout.names_end, layout.count)
-    return Scan(points, columns, "xyz", origin, source)
+    return (found.index("x"), found.index("y"), found.index("z")) if {"x", "y", "z"} <= set(found) else (0, 1, 2), names
+
+
+class XyzStream:
+    """A text file read and written in pieces of whole lines; each piece is a scan of some of its rows, without other columns."""
+
+    def __init__(self, raw: Raw, origin: str) -> None:
+        start = raw[:_STREAM_HEAD]
+        start = start[: start.rfind(b"\n") + 1]
+        octets = np.frombuffer(start, np.uint8)
+        starts, ends = find_lines(octets)
+        self.layout = _Layout.of(start, first_visible(octets, starts, ends), ends, origin)
+        self.body_start = int(starts[self.layout.first_row])
+        self.axes, _ = _named(
+            _rows(octets[self.body_start :], self.layout, origin, self.layout.first_row + 1), self.layout, origin
+        )
+        self.raw, self.origin, self.format = raw, origin, "xyz"
+        self._row_bytes = max(8, (len(start) - self.body_start) // max(1, len(starts) - self.layout.first_row))
+        self.n_points = (len(raw) - self.body_start) // self._row_bytes + 1
+        """Estimated from the first rows; exact once `pieces` has come to its end."""
+        self._extent = np.array([[np.inf] * 3, [-np.inf] * 3])
+        self._decimals = [(0, True)] * 3
+        self._is_known = False
+
+    @classmethod
+    def of(cls, raw: Raw, origin: str) -> XyzStream | None:
+        """The stream of a file, or None where lines do not end in LF. Raises ScanError if it is no point cloud."""
+        start = raw[:_STREAM_HEAD]
+        return None if b"\0" in start or b"\n" not in start else cls(raw, origin)
+
+    def pieces(self, n_rows: int) -> Iterator[Scan]:
+        """Scans of about n_rows rows, in order. Raises ScanError naming the first line that lacks a coordinate."""
+        at, line, n_points = self.body_start, self.layout.first_row + 1, 0
+        while at < len(self.raw):
+            last = min(at + n_rows * self._row_bytes, len(self.raw)) - 1
+            stop = (self.raw.find(b"\n", last) + 1) or len(self.raw)
+            rows = _rows(np.frombuffer(self.raw[at:stop], np.uint8), self.layout, self.origin, line)
+            points = np.stack(rows.numbers(self.axes), axis=1) if len(rows) else np.empty((0, 3))
+            if not self._is_known:
+                self._learn(rows, points)
+            head = self.raw[: self.body_start] if at == self.body_start else b""
+            names_end = self.layout.names_end if at == self.body_start else None
+            source = XyzSource(head, rows, self.axes, points, {}, {}, names_end, None)
+            yield Scan(points, {}, "xyz", self.origin, source)
+            let_go(self.raw)
+            line += int((rows.body == 10).sum())
+            at, n_points = stop, n_points + len(points)
+        if self.layout.n_claimed > n_points:
+            raise ScanError(f"{self.origin}: its count line claims {self.layout.n_claimed} points, the file holds {n_points}")
+        self.n_points, self._is_known = n_points, True
+
+    def _learn(self, rows: TextRows, points: Points) -> None:
+        """What the form of a moved coordinate depends on: the extent and the decimals of all rows."""
+        finite = points[np.isfinite(points).all(axis=1)]
+        if len(finite):
+            self._extent[0] = np.minimum(self._extent[0], finite.min(axis=0))
+            self._extent[1] = np.maximum(self._extent[1], finite.max(axis=0))
+        for i, column in enumerate(self.axes if len(rows) else ()):
+            digits, exponent = rows.decimals(column)
+            most, all_exponents = self._decimals[i]
+            if exponent == all_exponents:
+                self._decimals[i] = max(most, digits), exponent
+            elif all_exponents:
+                self._decimals[i] = digits, False
+
+    def write(self, pieces: Iterable[Scan], file: BinaryIO, *, format: str, provenance: Mapping[str, Any] | None = None) -> None:
+        """Write pieces of this stream, moved or with further columns, as `write` would write the whole."""
+        if not self._is_known:
+            for _ in self.pieces(_STREAM_HEAD // self._row_bytes):
+                pass
+        forms = [coordinate_form(self._extent, *decimals) for decimals in self._decimals]
+        for piece in pieces:
+            head, body = _own(piece, piece.source, forms)
+            file.write(head)
+            for octets in body:
+                file.write(octets)
 
 
 def unstorable(columns: Mapping[str, Column]) -> list[str]:
@@ -131,26 +217,35 @@ def write(scan: Scan, file: BinaryIO, *, suffix: str = ".xyz") -> None:
     else blanks under a `#` comment that names the columns if there are more than three.
     """
     if isinstance(scan.source, XyzSource):
-        source = scan.source
-        columns = {name: values for name, values in changed(scan).items() if holds_numbers(values)}
-        head, rows = source.head, source.rows
-        before = source.points()
-        moves = [(i, moved_rows(before[:, i], scan.points[:, i])) for i in range(3)]
-        fields = [coordinates(rows, source.axes[i], before, scan.points[:, i], moved) for i, moved in moves if moved.any()]
-        fields += [plain(columns.pop(name), index) for name, index in source.indices.items() if name in columns]
-        fields.sort(key=lambda change: change.column if isinstance(change.column, int) else 0)
-        if source.names_end is not None:
-            joint = " " if rows.delimiter is None else chr(rows.delimiter)
-            names = "".join(joint + name.replace(joint, "_") for name in columns)
-            head = head[: source.names_end] + names.encode() + head[source.names_end :]
+        head, body = _own(scan, scan.source, None)
     else:
         columns = {name: values for name, values in colours_as_bytes(portable(scan.attributes)).items() if holds_numbers(values)}
         head, rows = _created(len(scan), suffix, list(columns))
         form = f"%.{min(step_decimals(scan.points, _NEW_FILE_STEP), 15)}f"
         fields = [NewFields(scan.points[:, i], form, 0 if i == 0 else None) for i in range(3)]
+        body = rows.rewritten([*fields, *(plain(values) for values in columns.values())])
     file.write(head)
-    for piece in rows.rewritten([*fields, *(plain(values) for values in columns.values())]):
+    for piece in body:
         file.write(piece)
+
+
+def _own(scan: Scan, source: XyzSource, forms: Sequence[str] | None) -> tuple[bytes, Iterator[bytes]]:
+    """The bytes before the rows of a scan that came from text, and of the rows; forms: of x, y and z, else from the rows."""
+    columns = {name: values for name, values in changed(scan).items() if holds_numbers(values)}
+    head, rows = source.head, source.rows
+    before = source.points()
+    moves = [(i, moved_rows(before[:, i], scan.points[:, i])) for i in range(3)]
+    if forms is None:
+        fields = [coordinates(rows, source.axes[i], before, scan.points[:, i], moved) for i, moved in moves if moved.any()]
+    else:
+        fields = [NewFields(scan.points[:, i], forms[i], source.axes[i], moved) for i, moved in moves if moved.any()]
+    fields += [plain(columns.pop(name), index) for name, index in source.indices.items() if name in columns]
+    fields.sort(key=lambda change: change.column if isinstance(change.column, int) else 0)
+    if source.names_end is not None:
+        joint = " " if rows.delimiter is None else chr(rows.delimiter)
+        names = "".join(joint + name.replace(joint, "_") for name in columns)
+        head = head[: source.names_end] + names.encode() + head[source.names_end :]
+    return head, rows.rewritten([*fields, *(plain(values) for values in columns.values())])
 
 
 @dataclass(frozen=True)

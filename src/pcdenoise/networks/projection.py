@@ -6,7 +6,6 @@ losses and training (learning).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -64,23 +63,28 @@ def edges(offset: Tensor, index: Tensor, count: Tensor | None) -> Edges:
         squared = (offset / scale[:, :, None]).square().sum(-1)
         weight = torch.exp(-squared) * (1 - _KERNEL_SHARE**2 * squared).clamp_min(0).square()
         if count is not None:
-            weight = weight * count[index]
+            weight = weight * count.index_select(0, index.reshape(-1)).view(index.shape)
         weight = weight / weight.sum(-1, keepdim=True).clamp_min(1e-12)
     return Edges(offset / scale[:, :, None], index, weight, scale)
 
 
-def joined(parts: Sequence[Planes]) -> Planes:
-    """The planes of several blocks of rows, one after the other."""
-    return Planes(torch.cat([part.normal for part in parts]), torch.cat([part.shape for part in parts]))
+def at(values: Tensor, index: Tensor) -> Tensor:
+    """(M, K, C) rows of (N, C) values for (M, K) rows' numbers. Vectors come axis by axis in memory: sums over them are then
+    sums of long rows, many times faster than of three neighbouring numbers."""
+    flat = index.reshape(-1)
+    if values.shape[1] > 3:
+        return values.index_select(0, flat).view(*index.shape, -1)
+    return torch.stack([axis.index_select(0, flat).view(index.shape) for axis in values.unbind(1)]).permute(1, 2, 0)
 
 
 def planes(graph: Edges) -> Planes:
     """Weighted PCA of each neighbourhood, without gradient."""
     with torch.no_grad():
         offset, weight = graph.offset.double(), graph.weight.double()
-        mean = torch.einsum("mk,mki->mi", weight, offset)
-        spread = offset - mean[:, None]
-        covariance = torch.einsum("mki,mkj->mij", spread * weight[:, :, None], spread)
+        spread = [axis - (weight * axis).sum(-1, keepdim=True) for axis in offset.unbind(-1)]
+        pulling = [weight * axis for axis in spread]
+        entries = {(i, j): (pulling[i] * spread[j]).sum(-1) for i in range(3) for j in range(i, 3)}
+        covariance = torch.stack([entries[min(i, j), max(i, j)] for i in range(3) for j in range(3)], dim=-1).view(-1, 3, 3)
         eigenvalues, normal = smallest_eigenvector(covariance)
         return Planes(normal.to(graph.offset), graph.scale * eigenvalues.clamp_min(0).sqrt().to(graph.offset))
 
@@ -137,15 +141,15 @@ def edge_features(graph: Edges, own: Planes, theirs: Planes, noise: float) -> tu
     a: height of the neighbour over my plane; b: height of the neighbour's plane over me. All features keep their value when
     the cloud is rotated or mirrored and when any normal changes its sign.
     """
-    normal = theirs.normal[graph.source]
-    a = (graph.offset @ own.normal[:, :, None]).squeeze(-1)
+    normal = at(theirs.normal, graph.source)
+    a = (graph.offset * own.normal[:, None]).sum(-1)
     b = (graph.offset * normal).sum(-1)
-    cosine = (normal @ own.normal[:, :, None]).squeeze(-1)
+    cosine = (normal * own.normal[:, None]).sum(-1)
     level = (noise / graph.scale + 0.02).expand_as(a)
     high, deep = a.abs(), b.abs()
     features = torch.stack(
         [
-            graph.offset.norm(dim=-1),
+            graph.offset.square().sum(-1).clamp_min(1e-24).sqrt(),
             4 * high,
             4 * deep,
             cosine.square(),
@@ -153,10 +157,9 @@ def edge_features(graph: Edges, own: Planes, theirs: Planes, noise: float) -> tu
             high / (high + level),
             deep / (deep + level),
             4 * (graph.weight + 1e-4).sqrt(),
-        ],
-        dim=-1,
+        ]
     )
-    return features, a, b
+    return features.permute(1, 2, 0), a, b
 
 
 class MessageRound(nn.Module):
@@ -200,10 +203,11 @@ class Step(nn.Module):
 
     def forward(self, message: Tensor, graph: Edges, own: Planes, theirs: Planes, a: Tensor, b: Tensor) -> Tensor:
         """(M, 3) displacement in the unit of `graph.scale`'s lengths."""
-        sharpness, pull, lift = self.head(message).unbind(-1)
+        known = self.head.weight @ message.flatten(0, 1).t() + self.head.bias[:, None]
+        sharpness, pull, lift = known.view(3, *message.shape[:2])
         weight = graph.weight * torch.exp(4 * torch.tanh(sharpness / 4))
         weight = weight / weight.sum(-1, keepdim=True).clamp_min(1e-12)
-        pulled = ((weight * (0.5 + pull) * b)[:, None] @ theirs.normal[graph.source]).squeeze(1)
+        pulled = ((weight * (0.5 + pull) * b)[:, :, None] * at(theirs.normal, graph.source)).sum(1)
         lifted = (weight * (0.5 + lift) * a).sum(-1, keepdim=True) * own.normal
         move: Tensor = graph.scale * (pulled + lifted)
         return move

@@ -1,0 +1,507 @@
+"""Clouds larger than memory: cells on disk, each cleaned with what lies around it, so that a tile gives what the whole gives.
+
+Here: the cells, their surroundings, what is kept for a later `resume`. Not here: scan files (io), one pass (denoiser.py).
+
+All that is global in a pass is found first, streaming, exactly as it is found in memory: the frame's origin, the probes and the
+noise level they read, the stop rule. The rest is local, and every draw is a hash of a point's place in the file, so a cell needs
+nothing but a rim as wide as the network sees.
+
+FOLDER/plan.json        what is cleaned and how, and the cuts between the cells
+FOLDER/start/7.f64      distinct points of cell 7: x, y, z in the local frame and the hash of the place in the file, ascending
+FOLDER/start/7.i8       for each of its rows, in file order, which of these it is
+FOLDER/pass_2/7.f64     where they are after the second pass
+FOLDER/done/7.f64       its rows at their new places, and 1 for an outlier plus 2 for who stayed
+FOLDER/pass_2.json      the noise level after the second pass
+FOLDER/drift/7.json     how far its surface moved, see cloud.drift
+FOLDER/outliers/7.u1    whether each distinct point is an outlier
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcdenoise.cloud import drift
+from pcdenoise.cloud.neighbours import Distances, NeighbourSearch, coordinate_hash, distinct_by, drawn_by, spatial_order
+from pcdenoise.cloud.noise_level import N_PROBES, NoiseLevel, estimate_from
+from pcdenoise.cloud.scan import Mask, Points
+from pcdenoise.config import DenoiseConfig
+from pcdenoise.denoising import classical, denoiser, held_out, outliers
+from pcdenoise.denoising.denoiser import Identity, Progress
+from pcdenoise.networks.store import Model
+
+BASE_BYTES, POINT_BYTES = 400 << 20, 1100
+"""Memory of the program itself, and of each point of the part that is being cleaned (measured, with a tenth to spare)."""
+_CORE_SHARE = 0.55  # of a tile's points are the cell's own, the others its rim
+_RIM_RADII = 5.0
+"""Width of the rim in radii of the network's neighbourhoods. A pass reaches eight radii at most, but a neighbour's weight is zero
+at one radius, so that what lies beyond five does not reach a thousandth of the noise (a test measures it)."""
+_RIM_NEIGHBOURS = 24
+_LARGER_CELLS = 1.5  # than asked for are still gone on with: how much memory is free changes from run to run
+_SAMPLED = 256
+_FEWEST_IN_TILE = 512
+_GATHERED = (192, 2048)  # neighbours kept of each probe: most clouds show their surface within the first
+_N_LENGTHS = 1_000_000
+
+
+def needs_the_whole(model: Model | None, config: DenoiseConfig) -> str:
+    """What in these settings draws from a whole cloud, so that cells cannot be cleaned one by one; nothing if all is local."""
+    if config.unshrink:
+        return "--unshrink"
+    return "a model of network mcconv" if model is not None and model.config.network == "mcconv" else ""
+
+
+def needed_bytes(n_points: int) -> int:
+    """Memory that cleaning so many points at once takes."""
+    return BASE_BYTES + POINT_BYTES * n_points
+
+
+def points_per_cell(max_bytes: int) -> int:
+    """How many points a cell may have, so that it is cleaned within so much memory."""
+    return max(10_000, int(_CORE_SHARE * (max_bytes - BASE_BYTES) / POINT_BYTES))
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Points of one chunk after cleaning: points (n, 3), outlier (n,), unmoved (n,)."""
+
+    points: Points
+    outlier: Mask
+    unmoved: Mask
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Distinct points in the order of their hashes: where they are after some pass (n, 3), and identity (n,)."""
+
+    points: Points
+    identity: Identity
+
+
+class _Smallest:
+    """The n points of smallest key of a stream, each key once."""
+
+    def __init__(self, n: int) -> None:
+        self.n, self.keys, self.points = n, np.empty(0, np.uint64), np.empty((0, 3))
+
+    def add(self, keys: Identity, points: Points) -> None:
+        if len(keys) > self.n:
+            few = np.argpartition(keys, self.n)[: 4 * self.n]
+            keys, points = keys[few], points[few]
+        keys, points = np.concatenate([self.keys, keys]), np.concatenate([self.points, points])
+        keys, rows = np.unique(keys, return_index=True)
+        self.keys, self.points = keys[: self.n], points[rows[: self.n]]
+
+
+class Tiles:
+    """One cloud on its way through the cells. `chunks` streams its (n, 3) rows in file order, the same every time it is called.
+
+    fingerprint: facts that tell this job from another one; what is found in the folder of the same job is not done again.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        chunks: Callable[[], Iterable[Points]],
+        model: Model | None,
+        config: DenoiseConfig,
+        cell_points: int,
+        fingerprint: Mapping[str, Any],
+    ) -> None:
+        self.folder, self.chunks, self.model, self.config = folder, chunks, model, config
+        self.threads = config.threads or os.cpu_count() or 1
+        job = {**fingerprint, "config": config.model_dump(mode="json", exclude={"threads"})}
+        self.job = {**job, "model": model.sha256 if model else None}
+        self.cell_points = cell_points
+        self.figures: dict[str, Any] = {}
+        self.steps: list[dict[str, Any]] = []
+        self._gathered: dict[int, dict[bytes, tuple[Distances, Points]]] = {}
+
+    @cached_property
+    def plan(self) -> dict[str, Any]:
+        """Counts, origin, cuts and probes; cells are made on the disk if they are not there."""
+        path = self.folder / "plan.json"
+        if path.is_file():
+            plan: dict[str, Any] = json.loads(path.read_text())
+            if plan["job"] == json.loads(json.dumps(self.job)) and plan["cell_points"] <= _LARGER_CELLS * self.cell_points:
+                return plan
+        shutil.rmtree(self.folder, ignore_errors=True)
+        (self.folder / "start").mkdir(parents=True)
+        central, probed = _Smallest(denoiser.N_CENTRAL), _Smallest(N_PROBES)
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        n_rows = n_finite = 0
+        for chunk in self.chunks():
+            usable = chunk[np.isfinite(chunk).all(axis=1)]
+            identity = coordinate_hash(usable, 0)
+            central.add(identity, usable)
+            probed.add(drawn_by(identity, self.config.seed), usable)
+            n_rows, n_finite = n_rows + len(chunk), n_finite + len(usable)
+            low, high = np.minimum(low, usable.min(axis=0, initial=np.inf)), np.maximum(high, usable.max(axis=0, initial=-np.inf))
+        origin = denoiser.origin_of(central.points)
+        cuts = _cuts(central.points - origin, max(1, -(-n_finite // self.cell_points)))
+        plan = {
+            "job": self.job,
+            "cell_points": self.cell_points,
+            "n_rows": n_rows,
+            "n_finite": n_finite,
+            "origin": origin.tolist(),
+            "cuts": cuts,
+        }
+        plan |= {"n_cells": _n_cells(cuts), "probes": (probed.points - origin).tolist(), "probe_keys": probed.keys.tolist()}
+        plan["diagonal"] = float(np.linalg.norm((high - origin) - (low - origin))) if n_finite else 0.0
+        for chunk in self.chunks():
+            usable = chunk[np.isfinite(chunk).all(axis=1)]
+            rows = np.empty((len(usable), 4))
+            rows[:, :3], rows[:, 3] = usable - origin, coordinate_hash(usable, 0).view(np.float64)
+            for cell, those in _by_cell(_cell_of(rows[:, :3], cuts)):
+                with (self.folder / "start" / f"{cell}.f64").open("ab") as file:
+                    file.write(rows[those].tobytes())
+        plan["n_distinct"] = sum(self._sort(cell) for cell in range(plan["n_cells"]))
+        _write(path, json.dumps(plan).encode())
+        return plan
+
+    @property
+    def cells(self) -> range:
+        """The cells' numbers."""
+        return range(self.plan["n_cells"])
+
+    def run(self, on_progress: Progress = lambda _task, _share: None) -> None:
+        """All passes over all cells, and the figures of a `denoiser.Result`."""
+        level = first = self.level(0)
+        n_done = 0
+        if self.config.outliers != "keep":
+            for cell in self.cells:
+                self.find_outliers(cell, first)
+                on_progress("outliers", (cell + 1) / len(self.cells))
+        most = denoiser.most_passes(self.plan["n_distinct"], first, self.config)
+        judge = self._judge(first) if most and self.config.iters == "auto" else None
+        for number in range(1, most + 1):
+            task = "cleaning" if self.config.iters == 1 else f"pass {number}"
+            if judge is not None and judge.residual() is None:
+                break
+            for cell in self.cells:
+                self.clean(cell, number, level)
+                on_progress(task, (cell + 1) / len(self.cells))
+            after = self.level(number)
+            self.steps.append({"iteration": number, "roughness_before": level.std, "roughness_after": after.std})
+            if number > 2:
+                shutil.rmtree(self.folder / f"pass_{number - 2}", ignore_errors=True)
+            level, n_done = after, number
+        drifts = [self._drift(cell, n_done) for cell in self.cells]
+        share = np.array([n for n, _, _ in drifts]) / max(1, self.plan["n_distinct"])
+        self.figures = {
+            "noise": first.std,
+            "spacing": first.spacing,
+            "is_surface": first.is_surface,
+            "iterations": n_done,
+            "drift": float(np.sqrt((share * [size**2 for _, size, _ in drifts]).sum())),
+            "drift_inward": float((share * [inward for _, _, inward in drifts]).sum()),
+            "points_not_finite": self.plan["n_rows"] - self.plan["n_finite"],
+            "points_coincident": self.plan["n_finite"] - self.plan["n_distinct"],
+            "cells": len(self.cells),
+        }
+
+    def rows(self) -> Iterator[Rows]:
+        """Every chunk's rows at their new places, in file order; completes the figures. Needs `run` before."""
+        origin, n_done = np.array(self.plan["origin"]), self.figures["iterations"]
+        read = np.zeros(len(self.cells), dtype=np.int64)
+        lengths: list[NDArray[np.float64]] = []
+        step = -(-self.plan["n_rows"] // _N_LENGTHS) or 1
+        n_unmoved = n_outliers = 0
+        longest = 0.0
+        for cell in self.cells:
+            self._finish(cell, n_done)
+        for chunk in self.chunks():
+            finite = np.flatnonzero(np.isfinite(chunk).all(axis=1))
+            result = Rows(chunk.copy(), np.zeros(len(chunk), bool), np.ones(len(chunk), bool))
+            for cell, those in _by_cell(_cell_of(chunk[finite] - origin, self.plan["cuts"])):
+                path = self.folder / "done" / f"{cell}.f64"
+                done = np.fromfile(path, count=4 * len(those), offset=32 * read[cell]).reshape(-1, 4)
+                read[cell] += len(those)
+                rows, unmoved = finite[those], done[:, 3] >= 2
+                result.outlier[rows], result.unmoved[rows] = done[:, 3] % 2 == 1, unmoved
+                result.points[rows[~unmoved]] = done[~unmoved, :3] + origin
+            length = np.linalg.norm(result.points[finite] - chunk[finite], axis=1)
+            lengths.append(length[::step])
+            longest = max(longest, float(length.max(initial=0.0)))
+            n_unmoved, n_outliers = n_unmoved + int(result.unmoved.sum()), n_outliers + int(result.outlier.sum())
+            yield result
+        some = np.concatenate(lengths) if self.plan["n_finite"] else np.zeros(1)
+        self.figures |= {
+            "move_median": float(np.median(some)),
+            "move_p99": float(np.quantile(some, 0.99)),
+            "move_max": longest,
+            "points_left_alone": n_unmoved,
+            "outliers": n_outliers,
+        }
+
+    def level(self, number: int) -> NoiseLevel:
+        """The noise after so many passes, read at the same probes as in memory."""
+        path = self.folder / f"pass_{number}.json"
+        plan = self.plan
+        if path.is_file():
+            return NoiseLevel(**json.loads(path.read_text()))
+        probed, keys = np.array(plan["probes"]).reshape(-1, 3), np.array(plan["probe_keys"], np.uint64)
+        homes: dict[int, NDArray[np.int64]] = {}
+        for cell, those in _by_cell(_cell_of(probed, plan["cuts"])):
+            homes[cell] = those
+            part = self._part(cell, number)
+            drawn = drawn_by(part.identity, self.config.seed)
+            order = np.argsort(drawn)
+            probed[those] = part.points[order[np.searchsorted(drawn, keys[those], sorter=order)]]
+        cell_of = np.empty(len(probed), np.int64)
+        for cell, those in homes.items():
+            cell_of[those] = cell
+        home = {point.tobytes(): int(cell) for point, cell in zip(probed, cell_of, strict=True)}
+        self._gathered = {k: {} for k in _GATHERED}
+
+        def around(centres: Points, k: int) -> tuple[Distances, Points]:
+            kept = self._gathered[next(n for n in _GATHERED if n >= k)]
+            missing = np.array([centre.tobytes() not in kept for centre in centres])
+            if missing.any():
+                most = min(next(n for n in _GATHERED if n >= k), plan["n_distinct"])
+                cells = np.array([home[centre.tobytes()] for centre in centres[missing]])
+                for cell, those in _by_cell(cells):
+                    asked = centres[missing][those]
+                    distances, near = self._nearest(asked, cell, number, most)
+                    kept.update({centre.tobytes(): pair for centre, *pair in zip(asked, distances, near, strict=True)})
+            pairs = [kept[centre.tobytes()] for centre in centres]
+            return np.stack([distances[:k] for distances, _ in pairs]), np.stack([near[:k] for _, near in pairs])
+
+        found = estimate_from(probed, plan["n_distinct"], around)
+        self._gathered = {}
+        _write(path, json.dumps(asdict(found)).encode())
+        return found
+
+    def _nearest(self, centres: Points, cell: int, number: int, k: int) -> tuple[Distances, Points]:
+        """(M, k) distances and (M, k, 3) positions of the points nearest to some of a cell; the rim grows until they are."""
+        low, high = centres.min(axis=0), centres.max(axis=0)
+        own = self._part(cell, number).points
+        margin = 1.5 * float(NeighbourSearch(own, self.threads).knn(centres, min(k, len(own)))[0].max())
+        while True:
+            near = np.concatenate([own, *(part.points for part in self._rim(cell, number, low - margin, high + margin))])
+            if len(near) >= k:
+                near = near[spatial_order(near)]
+                distances, indices = NeighbourSearch(near, self.threads).knn(centres, k)
+                if distances.max() <= margin or len(near) == self.plan["n_distinct"]:
+                    return distances, near[indices]
+                margin = max(1.01 * float(distances.max()), margin)
+            margin *= 2
+
+    def _judge(self, level: NoiseLevel) -> denoiser.Judge:
+        """The held-out points of the whole cloud: those nearest to the first of all probes, as in memory."""
+        centre = np.array(self.plan["probes"][0])
+        most = min(held_out.MOST_POINTS, self.plan["n_distinct"])
+        part = self._part(int(_cell_of(centre[None], self.plan["cuts"])[0]), 0)
+        cell = int(_cell_of(centre[None], self.plan["cuts"])[0])
+        margin = max(float(np.ptp(part.points, axis=0).max()), 1e-12)
+        while True:
+            tile = _joined([part, *self._rim(cell, 0, centre - margin, centre + margin)])
+            distance = np.linalg.norm(tile.points - centre, axis=1)
+            if len(tile.points) == self.plan["n_distinct"] or (distance <= margin).sum() >= most:
+                break
+            margin *= 1.5
+        if most < len(tile.points):
+            nearest = np.argpartition(distance, most)[:most]
+            tile = _Part(tile.points[nearest], tile.identity[nearest])
+        order = spatial_order(tile.points)
+        halves = held_out.HeldOut(tile.points[order], tile.identity[order], level, self.config.seed, self.threads)
+        return denoiser.Judge(halves, level, self.plan["diagonal"], self.model, self.config, self.threads)
+
+    def _drift(self, cell: int, number: int) -> tuple[int, float, float]:
+        """How many points a cell has, and how far its surface moved in all passes, at all and inward."""
+        path = self.folder / "drift" / f"{cell}.json"
+        if not path.is_file():
+            start = self._part(cell, 0).points
+            moved = start if number == 0 else denoiser.limited(start, self._part(cell, number).points, self.config)
+            found = drift.measure(start, moved, self.config.seed, self.threads)
+            _write(path, json.dumps([len(start), found.size, found.inward]).encode())
+        n, size, inward = json.loads(path.read_text())
+        return n, size, inward
+
+    def clean(self, cell: int, number: int, level: NoiseLevel) -> None:
+        """Pass `number` over one cell, from what pass `number - 1` left there and around; nothing if that is done already."""
+        path = self.folder / f"pass_{number}" / f"{cell}.f64"
+        if path.is_file():
+            return
+        own, tile = self._tile(cell, number - 1)
+        order = spatial_order(tile.points)
+        moved = denoiser.one_pass(
+            tile.points[order], tile.identity[order], level, self.plan["diagonal"], self.model, self.config, self.threads
+        )
+        back = np.empty_like(tile.points)
+        back[order] = moved
+        _write(path, back[: len(own.points)].tobytes())
+
+    def find_outliers(self, cell: int, level: NoiseLevel) -> None:
+        """Marks the outliers of one cell; nothing if that is done already."""
+        path = self.folder / "outliers" / f"{cell}.u1"
+        if not path.is_file():
+            own, tile = self._tile(cell, 0)
+            order = spatial_order(tile.points)
+            found = np.zeros(len(order), bool)
+            found[order] = outliers.find(tile.points[order], level=level, threads=self.threads)
+            _write(path, found[: len(own.points)].tobytes())
+
+    def _tile(self, cell: int, number: int) -> tuple[_Part, _Part]:
+        """A cell's own points after a pass, and these followed by its rim."""
+        own = self._part(cell, number)
+        if not len(own.points):
+            return own, own
+        low, high = own.points.min(axis=0), own.points.max(axis=0)
+        ordered = own.points[spatial_order(own.points)]
+        level = self.level(number)
+        k = min(len(ordered), 1 + self._neighbours(level))
+        some = ordered[:: max(1, len(ordered) // _SAMPLED)]
+        radius = float(np.quantile(NeighbourSearch(ordered, self.threads).knn(some, k)[0][:, -1], 0.9))
+        margin = max(_RIM_RADII * radius, self._ball(level), 1e-12)
+        while True:
+            rim = list(self._rim(cell, number, low - margin, high + margin))
+            n = len(own.points) + sum(len(part.points) for part in rim)
+            if n >= min(_FEWEST_IN_TILE, self.plan["n_distinct"]):
+                break
+            margin *= 2
+        return own, _joined([own, *rim])
+
+    def _neighbours(self, level: NoiseLevel) -> int:
+        """How many nearest points a pass looks at, at that noise."""
+        if self.config.method != "network":
+            return self.config.neighbours or max(_RIM_NEIGHBOURS, classical.neighbourhood_size(level, 2))
+        from pcdenoise.denoising.pyramid import share_of_seeds
+
+        return max(_RIM_NEIGHBOURS, round(self._looked_at / share_of_seeds(level, self._looked_at)))
+
+    @property
+    def _looked_at(self) -> int:
+        return int(getattr(self.model.network.config, "neighbours", _RIM_NEIGHBOURS)) if self.model else _RIM_NEIGHBOURS
+
+    def _ball(self, level: NoiseLevel) -> float:
+        """Radius of what a pass looks at, where that is a length: in the bilateral filter."""
+        if self.config.method != "bilateral":
+            return 0.0
+        return classical.ball_radius(level) if self.config.radius is None else self.config.radius * self.plan["diagonal"]
+
+    def _rim(self, cell: int, number: int, low: Points, high: Points) -> Iterator[_Part]:
+        """The points of all other cells in a box after a pass."""
+        for other in self.cells:
+            if other != cell:
+                its_low, its_high = self._box(other, number)
+                if (its_low <= high).all() and (its_high >= low).all():
+                    part = self._part(other, number)
+                    inside = ((part.points >= low) & (part.points <= high)).all(axis=1)
+                    if inside.any():
+                        yield _Part(part.points[inside], part.identity[inside])
+
+    def _box(self, cell: int, number: int) -> tuple[Points, Points]:
+        if (cell, number) not in self._boxes:
+            points = self._part(cell, number).points
+            empty = np.full(3, np.inf), np.full(3, -np.inf)
+            self._boxes[cell, number] = (points.min(axis=0), points.max(axis=0)) if len(points) else empty
+        return self._boxes[cell, number]
+
+    @cached_property
+    def _boxes(self) -> dict[tuple[int, int], tuple[Points, Points]]:
+        return {}
+
+    def _sort(self, cell: int) -> int:
+        """Leaves one row for each place of a cell, in the order of the hashes; how many there are."""
+        path = self.folder / "start" / f"{cell}.f64"
+        rows = np.fromfile(path).reshape(-1, 4) if path.is_file() else np.empty((0, 4))
+        first, place = distinct_by(np.ascontiguousarray(rows[:, 3]).view(np.uint64))
+        _write(path, rows[first].tobytes())
+        _write(path.with_suffix(".i8"), place.astype(np.int64).tobytes())
+        return len(first)
+
+    def _part(self, cell: int, number: int) -> _Part:
+        """The distinct points of a cell after so many passes."""
+        rows = np.fromfile(self.folder / "start" / f"{cell}.f64").reshape(-1, 4)
+        identity = np.ascontiguousarray(rows[:, 3]).view(np.uint64)
+        if number == 0:
+            return _Part(np.ascontiguousarray(rows[:, :3]), identity)
+        return _Part(np.fromfile(self.folder / f"pass_{number}" / f"{cell}.f64").reshape(-1, 3), identity)
+
+    def _finish(self, cell: int, number: int) -> None:
+        """Writes the new places of a cell's rows, in file order; nothing if that is done already."""
+        path = self.folder / "done" / f"{cell}.f64"
+        if path.is_file():
+            return
+        start = self._part(cell, 0).points
+        moved = start if number == 0 else denoiser.limited(start, self._part(cell, number).points, self.config)
+        done = np.zeros((len(start), 4))
+        done[:, :3], done[:, 3] = moved, 2 * (moved == start).all(axis=1)
+        if self.config.outliers != "keep":
+            done[:, 3] += np.fromfile(self.folder / "outliers" / f"{cell}.u1", bool)
+        _write(path, done[np.fromfile(self.folder / "start" / f"{cell}.i8", np.int64)].tobytes())
+
+    def remove(self) -> None:
+        """Removes the work folder."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _joined(parts: list[_Part]) -> _Part:
+    return _Part(np.concatenate([part.points for part in parts]), np.concatenate([part.identity for part in parts]))
+
+
+def _write(path: Path, data: bytes) -> None:
+    """A file that is there whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(".part")
+    part.write_bytes(data)
+    os.replace(part, path)
+
+
+Cuts = list[Any]
+"""A cell's number in a list of its own, or [axis, place, cuts below, cuts from there on]."""
+
+
+def _cuts(sample: Points, n_cells: int) -> Cuts:
+    """Halves a sample across its longest axis again and again, until there are so many cells."""
+    next_number = iter(range(n_cells))
+
+    def cut(points: Points, n: int) -> Cuts:
+        if n == 1 or len(points) < 2:
+            return [next(next_number)]
+        axis = int(np.ptp(points, axis=0).argmax())
+        place = float(np.quantile(points[:, axis], (n // 2) / n))
+        below = points[:, axis] < place
+        if not below.any():
+            return [next(next_number)]
+        return [axis, place, cut(points[below], n // 2), cut(points[~below], n - n // 2)]
+
+    return cut(sample, n_cells)
+
+
+def _n_cells(cuts: Cuts) -> int:
+    return 1 if len(cuts) == 1 else _n_cells(cuts[2]) + _n_cells(cuts[3])
+
+
+def _cell_of(points: Points, cuts: Cuts) -> NDArray[np.int64]:
+    """(N,) the cell that each of (N, 3) points is in."""
+    cells = np.empty(len(points), np.int64)
+
+    def place(rows: NDArray[np.int64], cuts: Cuts) -> None:
+        if len(cuts) == 1:
+            cells[rows] = cuts[0]
+            return
+        below = points[rows, cuts[0]] < cuts[1]
+        place(rows[below], cuts[2])
+        place(rows[~below], cuts[3])
+
+    place(np.arange(len(points)), cuts)
+    return cells
+
+
+def _by_cell(cells: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
+    """Each cell that occurs and the rows, ascending, that are in it."""
+    order = np.argsort(cells, kind="stable")
+    found, first = np.unique(cells[order], return_index=True)
+    yield from zip(found.tolist(), np.split(order, first[1:]) if len(found) else [], strict=True)

@@ -1,0 +1,180 @@
+"""Clouds in cells: a tile gives what the whole gives, streams what is written whole, and goes on after a kill."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from known_clouds import UTM, cloud, model
+from pcdenoise import io
+from pcdenoise.cloud.scan import Scan
+from pcdenoise.commands.memory import LEAST, n_bytes
+from pcdenoise.config import DenoiseConfig
+from pcdenoise.denoising import denoiser, tiles
+from pcdenoise.denoising.tiles import Tiles
+from pcdenoise.errors import UsageError
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def cleaned_in_cells(points: np.ndarray, folder: Path, config: DenoiseConfig, cell_points: int) -> tuple[np.ndarray, Tiles]:
+    def chunks():
+        return (points[i : i + 701] for i in range(0, len(points), 701))
+
+    kind = model("seeded") if config.method == "network" else None
+    job = Tiles(folder, chunks, kind, config, cell_points, {})
+    job.run()
+    return np.concatenate([np.empty((0, 3)), *(rows.points for rows in job.rows())]), job
+
+
+CASES = {
+    "little noise": (0.3, {}, 1),
+    "seeds are drawn": (1.0, {}, 1),
+    "another seed": (1.0, {"seed": 5}, 2),
+    "passes after passes": (1.0, {"iters": 3, "relax_steps": 0}, 3),
+    "until it stops by itself": (0.5, {"iters": "auto"}, 4),
+    "half the way": (0.5, {"strength": 0.5, "max_move": 0.02, "outliers": "flag"}, 5),
+    "jets": (0.5, {"method": "jet"}, 6),
+    "bilateral": (0.5, {"method": "bilateral"}, 6),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_cells_give_what_the_whole_gives(name: str, tmp_path: Path) -> None:
+    std_spacings, settings, seed = CASES[name]
+    noisy = cloud("torus", 5000, std_spacings, seed)
+    rng = np.random.default_rng(seed)
+    points = np.concatenate([noisy.noisy, noisy.noisy[:20], np.full((3, 3), np.nan)])[rng.permutation(5023)] + UTM
+    config = DenoiseConfig(threads=1, **settings)
+    whole = denoiser.denoise(points, None if config.method != "network" else model("seeded"), config)
+    moved, job = cleaned_in_cells(points, tmp_path / "cells", config, int(rng.integers(700, 1500)))
+    assert len(job.cells) >= 4
+    # What reaches over the rim is a thousandth of the noise at most; a scanner's quantum is a hundredth or more.
+    np.testing.assert_allclose(moved, whole.points, atol=1e-3 * max(std_spacings, 0.3) * noisy.spacing)
+    for figure in ("iterations", "points_not_finite", "points_coincident", "outliers", "points_left_alone", "is_surface"):
+        assert job.figures[figure] == whole.figures[figure]
+    assert job.figures["noise"] == pytest.approx(whole.figures["noise"], rel=1e-9)
+
+
+def test_a_rim_is_needed_for_that(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    noisy = cloud("torus", 5000, 0.5)
+    whole = denoiser.denoise(noisy.noisy, model("seeded"), DenoiseConfig(threads=1))
+    monkeypatch.setattr(tiles, "_RIM_RADII", 0.3)
+    moved, _ = cleaned_in_cells(noisy.noisy, tmp_path / "cells", DenoiseConfig(threads=1), 1000)
+    assert np.abs(moved - whole.points).max() > 0.01 * noisy.spacing
+
+
+@pytest.mark.parametrize("few", [0, 3, 15, 40])
+def test_few_points_and_no_points(few: int, tmp_path: Path, rng: np.random.Generator) -> None:
+    points = rng.random((few, 3))
+    moved, _ = cleaned_in_cells(points, tmp_path / "cells", DenoiseConfig(threads=1), 1000)
+    np.testing.assert_allclose(moved, denoiser.denoise(points, model("seeded"), DenoiseConfig(threads=1)).points, atol=1e-12)
+
+
+def test_what_is_done_is_not_done_again_and_another_job_starts_anew(tmp_path: Path) -> None:
+    points = cloud("torus", 3000, 0.5).noisy
+    moved, job = cleaned_in_cells(points, tmp_path, DenoiseConfig(threads=1), 1000)
+    stamp = tmp_path / "pass_1" / "0.f64"
+    before = stamp.stat().st_mtime_ns
+    (tmp_path / "pass_1" / "1.f64").unlink()
+    again, _ = cleaned_in_cells(points, tmp_path, DenoiseConfig(threads=1), 1000)
+    assert again.tobytes() == moved.tobytes()
+    assert stamp.stat().st_mtime_ns == before
+    cleaned_in_cells(points, tmp_path, DenoiseConfig(threads=1, seed=1), 1000)
+    assert stamp.stat().st_mtime_ns != before
+    job.remove()
+    assert not tmp_path.exists()
+
+
+# Files
+
+
+def scan_of(n: int, format: str, folder: Path, rng: np.random.Generator) -> Path:
+    points = np.round(cloud("torus", n, 0.5).noisy, 4) + [1000, 2000, 30]
+    path = folder / f"scan.{format}"
+    columns = {"intensity": rng.integers(0, 999, n).astype("u2"), "confidence": rng.random(n).astype("f4")}
+    io.write(Scan(points, columns), path, format=format)
+    return path
+
+
+@pytest.mark.parametrize("format", ["las", "laz", "ply", "xyz"])
+def test_a_stream_is_written_as_the_whole_is(format: str, tmp_path: Path, rng: np.random.Generator) -> None:
+    path = scan_of(3000, format, tmp_path, rng)
+    whole = io.read(path)
+    shift = rng.normal(scale=0.01, size=whole.points.shape)
+    facts = {"how": "so"}
+    io.write(whole, tmp_path / f"same.{format}", provenance=facts)
+    changed = whole.moved_to(whole.points + shift).with_attributes(displacement=shift[:, 0].astype("f4"))
+    io.write(changed, tmp_path / f"whole.{format}", provenance=facts)
+    with io.streamed(path) as stream:
+        assert stream is not None
+        io.write_streamed(stream, stream.pieces(700), tmp_path / f"same_streamed.{format}", provenance=facts)
+        assert stream.n_points == 3000
+
+        def moved():
+            at = 0
+            for piece in stream.pieces(700):
+                part = shift[at : at + len(piece)]
+                yield piece.moved_to(piece.points + part).with_attributes(displacement=part[:, 0].astype("f4"))
+                at += len(piece)
+
+        io.write_streamed(stream, moved(), tmp_path / f"streamed.{format}", provenance=facts)
+    assert (tmp_path / f"same_streamed.{format}").read_bytes() == (tmp_path / f"same.{format}").read_bytes()
+    assert (tmp_path / f"streamed.{format}").read_bytes() == (tmp_path / f"whole.{format}").read_bytes()
+
+
+def test_a_stream_is_there_only_where_pieces_can_be_read(tmp_path: Path, milk: Path) -> None:
+    for path in ("-", milk):
+        with io.streamed(path) as stream:
+            assert stream is None
+
+
+def test_killed_at_any_moment_it_goes_on_to_the_same_bytes(tmp_path: Path, rng: np.random.Generator) -> None:
+    path = scan_of(6000, "laz", tmp_path, rng)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
+
+    def command(name: str, *more: str) -> list[str]:
+        options = ["--tile", "1000", "--iters", "2", "--threads", "1", "-q", *more]
+        return [sys.executable, "-m", "pcdenoise", "denoise", str(path), "-o", str(tmp_path / name), *options]
+
+    subprocess.run(command("undisturbed.laz"), env=environment, check=True, timeout=300)
+    folder = tmp_path / ".killed.laz.cells"
+    for n_cells in sorted(rng.choice(11, size=3, replace=False) + 1):
+        run = subprocess.Popen(command("killed.laz", "--resume"), env=environment)
+        while run.poll() is None and len(list(folder.glob("pass_*/*.f64"))) < n_cells:
+            time.sleep(0.005)
+        run.send_signal(signal.SIGKILL)
+        run.wait()
+    assert not (tmp_path / "killed.laz").exists()
+    subprocess.run(command("killed.laz", "--resume"), env=environment, check=True, timeout=300)
+    assert (tmp_path / "killed.laz").read_bytes() == (tmp_path / "undisturbed.laz").read_bytes()
+    assert not folder.exists()
+
+
+def test_sizes_of_memory() -> None:
+    assert n_bytes("2G") == 2 << 30
+    assert n_bytes("1.5g") == 3 << 29
+    assert n_bytes("800MiB") == 800 << 20
+    assert n_bytes(None) >= LEAST
+    for wrong in ("2", "G", "-1G", "100M", "1T"):
+        with pytest.raises(UsageError, match="--max-memory"):
+            n_bytes(wrong)
+
+
+def test_the_benchmark_of_speed_runs(tmp_path: Path) -> None:
+    script = ROOT / "benchmarks" / "speed" / "measure.py"
+    command = [sys.executable, str(script), "--quick", "--only", "pcdenoise", "scipy kNN", "-o", str(tmp_path)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
+    subprocess.run(command, env=environment, check=True, timeout=300, capture_output=True)
+    rows = json.loads((tmp_path / "speed.json").read_text())["rows"]
+    assert [(row["name"], row["n"]) for row in rows] == [(name, n) for n in (2000, 4000) for name in ("pcdenoise", "scipy kNN")]
+    assert all(row["per_cpu_s"] > 0 and row["peak_bytes"] > 2**20 for row in rows)
+    assert (tmp_path / "speed.png").read_bytes().startswith(b"\x89PNG")
