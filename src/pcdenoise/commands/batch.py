@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Sequence
 from typing import Any
 
 from pcdenoise.commands.console import Console
 from pcdenoise.commands.files import Job
-from pcdenoise.errors import BatchError, PcdenoiseError, of_the_system
+from pcdenoise.commands.workers import Engine, Figures, Outcome, Work, here
+from pcdenoise.errors import BatchError, PcdenoiseError
 
-Figures = dict[str, Any]
-"""Numbers about one input, by name."""
+__all__ = ["Batch", "Figures"]
 
 
 class Batch:
@@ -21,20 +22,23 @@ class Batch:
         self.records: list[dict[str, Any]] = []
         self._errors: list[PcdenoiseError] = []
 
-    def run(self, jobs: Sequence[Job], work: Callable[[Job], Figures]) -> None:
-        """One record per job, in order. An expected error of one job, or the system's (disk, memory), becomes its record."""
-        for job in jobs:
-            names = {"input": str(job.source), "output": str(job.target)}
-            try:
-                self.records.append({**names, "status": "done", "figures": work(job)})
-            except Exception as fault:
-                error = fault if isinstance(fault, PcdenoiseError) else of_the_system(fault, str(job.source))
-                if error is None:
-                    raise
-                self._errors.append(error)
-                self.records.append({**names, "status": "failed", "error": str(error), "exit_code": error.exit_code})
-                if len(jobs) > 1:
-                    self.console.fault(str(error))
+    def run(self, jobs: Sequence[Job], work: Work, engine: Engine = here) -> None:
+        """One record per job, in the jobs' order, whatever the order in which they are done."""
+        records: dict[Job, dict[str, Any]] = {}
+        for outcome in engine(jobs, work):
+            if outcome.said and not self.console.quiet:
+                print(outcome.said, end="", file=sys.stderr, flush=True)
+            records[outcome.job] = self._record(outcome, is_single=len(jobs) == 1)
+        self.records += [records[job] for job in jobs]
+
+    def _record(self, outcome: Outcome, is_single: bool) -> dict[str, Any]:
+        names = {"input": str(outcome.job.source), "output": str(outcome.job.target)}
+        if outcome.error is None:
+            return {**names, "status": "done", "figures": outcome.figures}
+        self._errors.append(outcome.error)
+        if not is_single:
+            self.console.fault(str(outcome.error))
+        return {**names, "status": "failed", "error": str(outcome.error), "exit_code": outcome.error.exit_code}
 
     def close(self) -> None:
         """Raises the error of a single input as it is, and BatchError if any of several failed."""

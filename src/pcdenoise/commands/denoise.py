@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import time
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pcdenoise.commands import options, outputs, selection
+from pcdenoise.commands import files, options, outputs, selection
+from pcdenoise.commands import workers as workers_
 from pcdenoise.commands.batch import Batch, Figures
 from pcdenoise.commands.console import Console, figure, table
 from pcdenoise.commands.files import STREAM, Job, expand, format_of, plan, refuse_existing
@@ -38,6 +40,7 @@ Neighbours = Annotated[int | None, _filter("--neighbours", min=1, help="mean, je
 Radius = Annotated[float | None, _filter("--radius", help="bilateral: share of the bounding box's diagonal.")]
 SigmaD = Annotated[float | None, _filter("--sigma-d", help="bilateral: fall with distance, a share of the diagonal.")]
 SigmaN = Annotated[float | None, _filter("--sigma-n", help="bilateral: fall with height, a share of the diagonal.")]
+_many = partial(option, rich_help_panel="Many scans, many machines")
 Unshrink = Annotated[
     bool | None,
     option("--unshrink/--shrink", help="Take moves that whole regions share back; by default with mcconv models only."),
@@ -73,7 +76,22 @@ def denoise(
         option("--max-memory", metavar="SIZE", help="Never hold more than this: 800M, 2G; half of what is free if not given."),
     ] = None,
     tile: Annotated[int | None, option("--tile", min=1000, help="Clean in cells on disk, of so many points.")] = None,
-    resume: Annotated[bool, option("--resume", help="Go on with the cells of a run that was killed.")] = False,
+    resume: Annotated[
+        bool, option("--resume", help="Keep outputs that are there, and go on with the cells of a scan where a run was killed.")
+    ] = False,
+    workers: Annotated[
+        int, _many("--workers", min=1, help="So many inputs at a time, each in a process; memory and threads are shared out.")
+    ] = 1,
+    shard: Annotated[
+        str | None, _many("--shard", metavar="I/N", help="Only the I-th of N shares of the inputs, for N jobs like this one.")
+    ] = None,
+    engine: Annotated[
+        Literal["local", "dask"], _many("--engine", help="Where workers run: on this machine, or on a Dask cluster.")
+    ] = "local",
+    scheduler: Annotated[
+        str | None,
+        _many("--scheduler", metavar="ADDRESS", help="Of the Dask cluster, such as tcp://head:8786; else a local one."),
+    ] = None,
     format: options.Format = None,
     suffix: Annotated[str, option("--suffix", help="Put between name and extension when the output is a folder.")] = "",
     overwrite: options.Overwrite = False,
@@ -102,21 +120,29 @@ def denoise(
         unshrink=unshrink, neighbours=neighbours, radius=radius, sigma_d=sigma_d, sigma_n=sigma_n, seed=seed, threads=threads,
     )  # fmt: skip
     console, sources = Console(quiet, verbose), expand(inputs)
+    if shard:
+        sources = files.shard(sources, shard)
     if dry_run:
         print(_plan_text(sources, output, suffix, format, settings))
         return
     if not output:
         raise UsageError("-o is missing; say where the result goes: -o clean.las, -o folder/ or -o -")
-    jobs = plan(sources, output, suffix=suffix, format=format)
+    run = workers_.chosen(workers, engine, scheduler)
+    if workers > 1:
+        settings = settings.model_copy(update={"threads": settings.threads or max(1, (os.cpu_count() or 1) // workers)})
+    jobs = plan(sources, output, suffix=suffix, format=format) if sources else []
     pictures = {job.source: job.target for job in plan(sources, str(picture), format="png")} if picture else {}
-    refuse_existing([*(job.target for job in jobs), *pictures.values(), report], overwrite)
+    if resume:
+        jobs = [job for job in jobs if job.target == STREAM or not job.target.exists()]
+        pictures = {job.source: pictures[job.source] for job in jobs if job.source in pictures}
+    refuse_existing([*(job.target for job in jobs), *pictures.values(), report], overwrite or resume)
     chosen = selection.Selection.of(only_class, context, roi)
     cleaning = _Cleaning(
         settings, chosen, chosen_model(model, settings), console, format, overwrite, drop_attributes, displacement, max_drift,
-        pictures, n_bytes(max_memory), tile, resume,
+        pictures, n_bytes(max_memory) // workers, tile, resume,
     )  # fmt: skip
     batch = Batch(console)
-    batch.run(jobs, cleaning.clean)
+    batch.run(jobs, cleaning.clean, run)
     if report:
         page = cleaning.pages[0] if len(jobs) == len(cleaning.pages) == 1 else None
         outputs.save_report(report, "denoise", cleaning.settings, batch.records, page, overwrite=overwrite)

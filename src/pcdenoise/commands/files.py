@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import glob
+import heapq
 import os
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,6 +74,25 @@ def _matches(pattern: str) -> Iterator[Path]:
             if real not in entered:
                 entered.add(real)
                 yield from _matches(os.path.normpath(os.path.join(glob.escape(folder), after)))
+
+
+def shard(sources: Sequence[Path], text: str) -> list[Path]:
+    """The share of the sources that the I-th of N jobs has, for text "I/N", I from 1; together they have each once.
+
+    Large files are dealt out first, each to the job that has least to do, so that jobs end at about the same time.
+    """
+    asked = re.fullmatch(r"([1-9]\d{0,5})/([1-9]\d{0,5})", text)
+    if asked is None or int(asked[1]) > int(asked[2]):
+        raise UsageError(f"--shard {text}: give which of how many, such as 3/20")
+    if STREAM in sources:
+        raise UsageError("--shard: standard input cannot be shared out; name files")
+    of_job: list[set[Path]] = [set() for _ in range(int(asked[2]))]
+    bytes_of_job = [(0, job) for job in range(len(of_job))]
+    for size, source in sorted(((source.stat().st_size, source) for source in sources), key=lambda pair: (-pair[0], pair[1])):
+        filled, job = heapq.heappop(bytes_of_job)
+        of_job[job].add(source)
+        heapq.heappush(bytes_of_job, (filled + size, job))
+    return [source for source in sources if source in of_job[int(asked[1]) - 1]]
 
 
 def plan(sources: Sequence[Path], output: str, *, suffix: str = "", format: str | None = None) -> list[Job]:
