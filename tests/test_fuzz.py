@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import struct
 import subprocess
 import sys
+import warnings
 import zipfile
 from io import BytesIO
 from pathlib import Path
@@ -29,6 +31,8 @@ SEEDS = {
     "xyz": list(io_samples.XYZ.values()),
     "bin": [bytes(160)],
 }
+PLY = "ply\nformat binary_little_endian 1.0\nelement vertex N\nproperty float x\nproperty float y\nproperty float z\n"
+PCD = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH N\nHEIGHT 1\nPOINTS N\nDATA binary\n"
 TOKENS = [
     b"4294967295", b"-1", b"0", b"1e309", b"nan", b"99999999999999999999", b"property list uchar int x\n", b"property float x\n",
     b"element vertex 9\n", b"end_header\n", b"FIELDS x y z\n", b"COUNT 1 1 99999\n", b"DATA binary\n", b"\xff\xff\xff\xff",
@@ -53,13 +57,35 @@ def damaged(draw: st.DrawFn, kind: str) -> bytes:
 def test_a_reader_gives_a_sound_scan_or_one_line(kind: str, data: st.DataObject) -> None:
     raw = data.draw(damaged(kind))
     try:
-        scan = READERS[kind](raw, "fuzzed")
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            scan = READERS[kind](raw, "fuzzed")
     except ScanError as fault:
         assert "\n" not in str(fault)
         assert str(fault).startswith("fuzzed")
         return
     assert scan.points.dtype == np.float64
     assert all(len(values) == len(scan) for values in scan.attributes.values())
+
+
+def with_scale(scale: float) -> bytes:
+    raw = io_samples.las(2, 0)
+    return raw[:131] + struct.pack("<d", scale) + raw[139:]
+
+
+@pytest.mark.parametrize(
+    ("kind", "raw"),
+    [
+        ("las", with_scale(1e304)),
+        ("pcd", PCD.replace("DATA binary", "DATA ascii").replace("z\n", "z rgb\n").replace("4\n", "4 4\n", 1)
+            .replace("F\n", "F F\n").replace("1\n", "1 1\n", 1).replace("N", "1").encode() + b"1 2 3 1e40\n"),
+    ],
+    ids=["a scale beyond float64", "a packed colour beyond float32"],
+)  # fmt: skip
+def test_files_that_once_gave_warnings_are_read_without_a_word(kind: str, raw: bytes) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(READERS[kind](raw, "found")) > 0
 
 
 VALUES = st.recursive(
@@ -121,8 +147,6 @@ def claims(header: str, n: int) -> bytes:
     return header.replace("N", str(n)).encode()
 
 
-PLY = "ply\nformat binary_little_endian 1.0\nelement vertex N\nproperty float x\nproperty float y\nproperty float z\n"
-PCD = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH N\nHEIGHT 1\nPOINTS N\nDATA binary\n"
 PROPERTIES = b"".join(b"property float p%d\n" % i for i in range(200_000))
 HOSTILE = {
     "zip.las": zipped(3), "zip.xyz": zipped(1), "points.ply": claims(PLY + "end_header\n", 4_000_000_000) + bytes(100),
