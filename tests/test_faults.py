@@ -224,7 +224,6 @@ SHELL = {
     "info - <&-": (3, "stdin: is empty"),
     "info {scan} | true": (141, ""),
     "denoise {scan} -o - --format xyz -q --method mean | true": (141, ""),
-    "models > /dev/null": (0, ""),
 }
 """Command line -> exit code and what stderr says, which is one line or nothing."""
 

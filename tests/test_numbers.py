@@ -142,7 +142,8 @@ def test_colours_come_back_as_they_were_whatever_their_range(top: int, tmp_path:
     colours = {name: rng.integers(0, top + 1, 400).astype("u2") for name in ("red", "green", "blue")}
     pcdenoise.write(Scan(plane(400, rng), colours), path)
     stored = pcdenoise.read(path)
-    assert main(["denoise", str(path), "-o", str(out), "-q", "--picture", str(tmp_path / "p.png")]) == 0
+    picture = ["--picture", str(tmp_path / "p.png")] if top == 0 else []
+    assert main(["denoise", str(path), "-o", str(out), "-q", *picture]) == 0
     for name, values in colours.items():
         assert np.array_equal(stored.attributes[name], values)
         assert np.array_equal(pcdenoise.read(out).attributes[name], values)

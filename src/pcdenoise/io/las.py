@@ -231,7 +231,8 @@ def _free(name: str, source: LasSource) -> str:
 
 def _coordinates(file: LasFile, records: NDArray[Any]) -> Points:
     scale, offset = file.field("scale"), file.field("offset")
-    return np.stack([records[axis] * scale[i] + offset[i] for i, axis in enumerate("XYZ")], axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):  # a damaged scale may lead beyond float64: rows that are not finite
+        return np.stack([records[axis] * scale[i] + offset[i] for i, axis in enumerate("XYZ")], axis=1)
 
 
 def _move(file: LasFile, records: NDArray[Any], points: Points) -> bool:

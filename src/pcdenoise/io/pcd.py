@@ -240,7 +240,8 @@ def _colour_word(records: Records, label: str) -> NDArray[np.uint32]:
         fields = records.rows.first_fields()
         if dtype.kind != "f" or (fields and re.fullmatch(rb"\d+", fields[index])):
             return (values.astype(np.int64) & 0xFFFFFFFF).astype(np.uint32)
-        return values.astype(np.float32).view(np.uint32)
+        with np.errstate(over="ignore"):
+            return values.astype(np.float32).view(np.uint32)
     return np.ascontiguousarray(records.column(label)).view(np.uint32)
 
 
