@@ -87,10 +87,9 @@ def bilateral(
 
     Digne and de Franchis, "The Bilateral Filter for Point Clouds" (IPOL 2017): weights exp(-d² / 2σ_d² - h² / 2σ_n²) in a ball,
     d the distance and h the height over the tangent plane; its normal is the PCA normal of the ball. Lengths are in the points'
-    unit. By default radius = max(4 noise stds, 4 spacings), σ_d = radius / 2, σ_n = 3 noise stds, with the noise measured if not
-    given.
-    Of a ball with more than `max_neighbours` points the nearest count. Without measurable noise (too few points, exact planes)
-    there is no default, and points stay where they are. Raises UsageError unless every argument is above 0.
+    unit. By default radius = max(4 noise stds, 4 spacings), σ_d = radius / 2, σ_n = 3 noise stds; the noise is measured
+    if not given. Of a ball with more than `max_neighbours` points the nearest count. Without measurable noise (too few points,
+    exact planes) there is no default, and points stay where they are. Raises UsageError unless every argument is above 0.
     """
     if radius is None or sigma_n is None:
         level = level or noise_level.estimate(points, threads=threads)

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from pcdenoise.cloud import drift
 from pcdenoise.cloud.neighbours import Distances, NeighbourSearch, coordinate_hash, distinct_by, drawn_by, spatial_order
 from pcdenoise.cloud.noise_level import N_PROBES, NoiseLevel, estimate_from
-from pcdenoise.cloud.scan import Mask, Points
+from pcdenoise.cloud.scan import Mask, Points, check_extent
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import classical, denoiser, held_out, outliers
 from pcdenoise.denoising.denoiser import Identity, Progress
@@ -145,6 +145,7 @@ class Tiles:
             central.add(identity, usable)
             probed.add(drawn_by(identity, self.config.seed), usable)
             n_rows, n_finite = n_rows + len(chunk), n_finite + len(usable)
+            check_extent(usable)
             low, high = np.minimum(low, usable.min(axis=0, initial=np.inf)), np.maximum(high, usable.max(axis=0, initial=-np.inf))
         origin = denoiser.origin_of(central.points)
         cuts = _cuts(central.points - origin, max(1, -(-n_finite // self.cell_points)))
