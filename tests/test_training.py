@@ -12,7 +12,10 @@ import torch
 from pcdenoise.config import TrainConfig
 from pcdenoise.errors import ModelError, UsageError
 from pcdenoise.learning import trainer
-from pcdenoise.learning.dataset import CloudSource, draw_cloud, surfaces_from
+from pcdenoise.learning.dataset import CloudSource, Surface, draw_cloud, from_surface
+from pcdenoise.learning.distill import cleaned
+from pcdenoise.learning.sources import noisy_from, surfaces_from
+from pcdenoise.learning.split import HeldOut
 from pcdenoise.learning.supervised import NearestSurface, supervised_loss
 from pcdenoise.networks import store
 from pcdenoise.networks.projection import ProjectionConfig, ProjectionNetwork
@@ -20,15 +23,14 @@ from pcdenoise.synthesis.shapes import sphere
 
 
 @pytest.fixture(scope="module")
-def surface() -> tuple[np.ndarray, np.ndarray]:
+def surface() -> Surface:
     sample = sphere().sample(200_000, np.random.default_rng(0))
-    return sample.points, sample.normals
+    return Surface(sample.points, sample.normals)
 
 
 def test_the_error_of_a_prediction_is_its_distance_to_the_sphere(surface):
-    cloud = draw_cloud(*surface, 24, np.random.default_rng(1))
-    points = cloud.surface[:500] * np.linspace(0.9, 1.1, 500)[:, None]
-    error = NearestSurface(cloud).error(torch.from_numpy(points).float()).numpy()
+    points = surface.points[:500] * np.linspace(0.9, 1.1, 500)[:, None]
+    error = NearestSurface(surface).error(torch.from_numpy(points).float()).numpy()
     # A sample's tangent disc of radius t is t²/2 off the unit sphere; samples are within 0.02 of each other.
     np.testing.assert_allclose(error, np.abs(np.linspace(-0.1, 0.1, 500)), atol=0.02**2 / 2 + 1e-5)
 
@@ -36,7 +38,8 @@ def test_the_error_of_a_prediction_is_its_distance_to_the_sphere(surface):
 def test_training_clouds_depend_on_seed_and_number_alone(tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
-    sources = [CloudSource(surfaces_from(["shapes:2"], 5, tmp_path / name), 5) for name in ("a", "b")]
+    loads = [surfaces_from(["shapes:2"], 5, tmp_path / name)[0] for name in ("a", "b")]
+    sources = [CloudSource([[partial(from_surface, load) for load in some]], 5) for some in loads]
     first, again = (source.cloud(3, 24) for source in sources)
     np.testing.assert_array_equal(first.seeds, again.seeds)
     np.testing.assert_array_equal(first.judged, again.judged)
@@ -45,7 +48,7 @@ def test_training_clouds_depend_on_seed_and_number_alone(tmp_path):
 
 def test_learning_from_one_cloud_lowers_its_error(surface):
     torch.manual_seed(0)
-    cloud = draw_cloud(*surface, 24, np.random.default_rng(2))
+    cloud = draw_cloud(surface, 24, np.random.default_rng(2))
     network = ProjectionNetwork(ProjectionConfig(channels=8, rounds=(1,)))
     optimiser = torch.optim.Adam(network.parameters(), lr=1e-2)
     losses = []
@@ -98,3 +101,87 @@ def test_meshes_are_found_in_folders_and_point_clouds_are_not_taken_for_them(tmp
     (tmp_path / "deep" / "shape.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     both = surfaces_from([str(tmp_path), "shapes:3"], 0, tmp_path / "second")
     assert [len(surfaces) for surfaces in both] == [1, 3]
+
+
+STD = 0.02
+
+
+def _noisy_plane(rng: np.random.Generator) -> np.ndarray:
+    return np.column_stack([rng.uniform(-1, 1, (20_000, 2)), np.zeros(20_000)]) + STD * rng.standard_normal((20_000, 3))
+
+
+def _feet(held_out: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Where the split signal would have each place be, whichever way it is reached."""
+    target = HeldOut(held_out, STD)
+    places = torch.from_numpy(places).double().requires_grad_()
+    height, known = target.heights(places.float())
+    assert known.mean() > 0.95
+    height.sum().backward()
+    feet = (places - height.double()[:, None] * places.grad).detach().numpy()
+    return feet[known]
+
+
+@pytest.mark.parametrize("offset", [-STD, 0.0, STD])
+def test_held_out_points_put_predictions_on_the_plane_from_either_side(offset):
+    rng = np.random.default_rng(0)
+    places = np.column_stack([rng.uniform(-0.7, 0.7, (2000, 2)), np.full(2000, offset)])
+    height = _feet(_noisy_plane(rng), places)[:, 2]
+    # 20,000 points / (4 · area of a cylinder, some 60 points): fits around 2,000 places share points, so that about 200 are independent;
+    # each errs by 0.25 std.
+    assert abs(height.mean()) < 4 * 0.3 * STD / np.sqrt(200)
+
+
+@pytest.mark.parametrize("offset", [-STD, 0.0, STD])
+def test_held_out_points_put_predictions_on_the_sphere_but_for_the_curvature_term(offset):
+    rng = np.random.default_rng(1)
+    held_out, places = (rng.standard_normal((n, 3)) for n in (30_000, 2000))
+    held_out /= np.linalg.norm(held_out, axis=1, keepdims=True)
+    places *= (1 + offset) / np.linalg.norm(places, axis=1, keepdims=True)
+    radius = np.linalg.norm(_feet(held_out + STD * rng.standard_normal(held_out.shape), places), axis=1)
+    # A fit to points that err along the surface too lies Hσ² too deep (H = 1 / radius), and a cylinder of finite height as much again.
+    assert -2.5 * STD**2 < radius.mean() - 1 < 0.5 * STD**2
+
+
+def test_no_prediction_gets_below_the_noise_floor_of_held_out_points():
+    rng = np.random.default_rng(2)
+    seen, held_out = _noisy_plane(rng), _noisy_plane(rng)
+    inner = np.abs(seen[:, :2]).max(axis=1) < 0.7
+    truth = seen[inner] * [1, 1, 0]
+    height, known = HeldOut(held_out, STD).heights(torch.from_numpy(truth).float())
+    floor = float(height[known].square().mean())
+    raw, known = HeldOut(held_out, STD).heights(torch.from_numpy(seen[inner]).float())
+    assert 0 < floor < 0.25 * STD**2
+    # The seen noise is independent of the held-out points': both variances add up.
+    assert float(raw[known].square().mean()) == pytest.approx(STD**2 + floor, rel=0.1)
+
+
+def test_who_learns_without_truth_gets_the_noisy_files_of_a_synth_folder_alone(tmp_path):
+    rng = np.random.default_rng(3)
+    for name, level in (("a_clean.xyz", 0.0), ("a_noisy.xyz", STD)):
+        np.savetxt(tmp_path / name, rng.uniform(-1, 1, (600, 3)) * [1, 1, level])
+    (tmp_path / "dataset.json").write_text(json.dumps({"items": [{"clean": "a_clean.xyz", "noisy": [{"file": "a_noisy.xyz"}]}]}))
+    (clouds,) = noisy_from([str(tmp_path)], 0, tmp_path / "cache")
+    assert len(clouds) == 1
+    assert np.ptp(clouds[0]()[:, 2]) > 0
+
+
+def test_a_teacher_leaves_a_surface_closer_to_the_truth_and_the_noise_that_it_took_off(surface):
+    rng = np.random.default_rng(4)
+    noisy = surface.points[:20_000] + STD * rng.standard_normal((20_000, 3))
+    model = store.Model("untrained", ProjectionNetwork(ProjectionConfig(channels=4, rounds=(1, 1))), None, "")
+    made = cleaned(noisy, model, own_law=1.0)
+    np.testing.assert_allclose(made.points + made.residual, noisy, atol=1e-12)
+    assert np.std(np.linalg.norm(made.points, axis=1)) < 0.5 * STD
+    again = draw_cloud(made, 24, rng)
+    assert again.noise == pytest.approx(STD, rel=0.35)
+
+
+def test_an_adapted_model_is_kept_only_if_points_it_never_learned_from_say_so(tmp_path):
+    rng = np.random.default_rng(5)
+    np.savetxt(tmp_path / "scan.xyz", _noisy_plane(rng)[:6000])
+    config = TrainConfig(data=(str(tmp_path / "scan.xyz"),), steps=1, threads=1, laps=1)
+    summary = trainer.train(config, tmp_path / "model")
+    assert "weights are kept" in summary.verdict
+    if "starting" in summary.verdict:
+        kept, shipped = (store.load(name).network.state_dict() for name in (tmp_path / "model", store.DEFAULT))
+        assert all(torch.equal(kept[name], shipped[name]) for name in shipped)

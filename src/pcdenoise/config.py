@@ -9,6 +9,10 @@ from pydantic import BaseModel, ConfigDict, Field
 Method = Literal["network", "mean", "bilateral", "jet"]
 
 
+Signal = Literal["supervised", "split", "distill", "total"]
+"""What a network learns from."""
+
+
 class Settings(BaseModel):
     """Base of all settings."""
 
@@ -42,9 +46,12 @@ class DenoiseConfig(Settings):
 class TrainConfig(Settings):
     """How a network learns."""
 
-    method: Literal["supervised", "total"] = Field(
-        "supervised", description="Signal; supervised: surfaces or clouds that are known, total: noisy scans alone."
+    method: Signal | None = Field(
+        None,
+        description="Signal; supervised: surfaces or clouds that are known; split: noisy points held out; distill: noisy clouds"
+        " that a teacher cleaned; total: neighbours drawn by a prior. By default supervised, for scans distill.",
     )
+    laps: int = Field(2, ge=1, le=20, description="How often distillation makes what was learned the teacher.")
     network: Literal["projection", "mcconv"] = Field("projection", description="Architecture; mcconv is the paper's.")
     pairs: bool = Field(False, description="Supervised by the noisy and clean clouds of synth folders, not by surfaces.")
     prior: Literal["full", "space", "none"] = Field("space", description="What makes a neighbour likely: space, and colour.")
@@ -62,7 +69,7 @@ class TrainConfig(Settings):
     rounds: tuple[int, ...] = Field((2, 2), min_length=1, description="Rounds of messages in each stage.")
     landing_rounds: int = Field(2, ge=1, le=8, description="Rounds of messages in which all points land on the seeds' surface.")
     data: tuple[str, ...] = Field(
-        ("shapes:400",), min_length=1, description="What to learn from: shapes:N, meshes, folders of meshes; each as often."
+        ("shapes:400",), min_length=1, description="What to learn from: shapes:N, meshes, scans, folders; each as often."
     )
     steps: int | None = Field(None, ge=1, description="Clouds to learn from; or give a budget.")
     budget_s: float | None = Field(None, gt=0, description="Seconds to learn for; or give steps.")

@@ -27,14 +27,14 @@ def train(
             "--data",
             metavar="SOURCE",
             envvar="PCDENOISE_TRAIN_DATA",
-            help="shapes:N (procedural), a mesh, a folder of meshes or one made by synth; for total and --pairs: scans,"
+            help="shapes:N (procedural), a mesh, a folder of meshes or one made by synth; else noisy scans,"
             " folders of scans, synth folders. Repeat to mix. Default: shapes:400.",
         ),
     ] = ["shapes:400"],  # noqa: B006
     method: Annotated[
-        Literal["supervised", "total"],
-        option("--method", help="What the model learns from: surfaces that are known, or (total) noisy scans alone."),
-    ] = "supervised",
+        Literal["supervised", "split", "distill", "total"] | None,
+        option("--method", help="Learn from known surfaces (supervised) or noisy points alone (the rest). Scans: distill."),
+    ] = None,
     network: Annotated[
         Literal["projection", "mcconv"], option("--network", help="The network's form; mcconv is that of Total Denoising.")
     ] = "projection",
@@ -64,7 +64,9 @@ def train(
     part_points: Annotated[int, _prior("--part-points", min=1000, help="Cut larger scans to parts of so many points.")] = 150_000,
     steps: Annotated[int | None, option("--steps", min=1, help="Stop after so many steps.")] = None,
     budget: Annotated[str | None, option("--budget", metavar="TIME", help="Stop after so long: 90s, 20m, 1.5h.")] = None,
-    init: Annotated[str | None, option("--init", metavar="NAME|DIR", help="Start from this model.")] = None,
+    init: Annotated[
+        str | None, option("--init", metavar="NAME|DIR", help="Start from this model, or none; scans: default.")
+    ] = None,
     resume: Annotated[bool, option("--resume", help="Go on where an interrupted run in the same folder stopped.")] = False,
     report: options.Report = None,
     overwrite: options.Overwrite = False,
@@ -74,6 +76,8 @@ def train(
     quiet: options.Quiet = False,
 ) -> None:
     """Train a model. Ctrl-C keeps what was learned so far.
+
+    From scans alone, the shipped model is adapted to their noise, and kept as it was unless that helps on points it has not seen.
 
     Example: pcdenoise train -o my_model --budget 20m
     """

@@ -1,4 +1,7 @@
-"""Clouds to learn from: noisy points, their seeds, and where the true surface is. Not here: losses and the training loop."""
+"""Clouds to learn from: noisy points, their seeds, and, where something knows it, the surface.
+
+Not here: where surfaces and scans come from (sources.py), losses, the training loop.
+"""
 
 from __future__ import annotations
 
@@ -7,24 +10,19 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from itertools import count
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pcdenoise.cloud.neighbours import spatial_order
+from pcdenoise.cloud.neighbours import coordinate_hash, knn, spatial_order
 from pcdenoise.cloud.noise_level import estimate
 from pcdenoise.denoising.pyramid import coarsen, share_of_seeds
-from pcdenoise.errors import ScanError, UsageError
 from pcdenoise.synthesis import noise
-from pcdenoise.synthesis.meshes import MESH_SUFFIXES, load_mesh, sample_mesh
-from pcdenoise.synthesis.shapes import in_unit_sphere, random_surface
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -47,29 +45,49 @@ _LAWS = {
 """How often each law of noise is met."""
 
 
+_LIKELY_OTHERS = 6
+"""Residuals come from any of so many samples: were it the nearest, neighbours would share one and the noise would look smaller."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Samples of a surface in the unit sphere, as exact as whoever gave them knows it.
+
+    points (S, 3), normals (S, 3) of either sign; disc: radius of the tangent disc that a sample stands for.
+    residual (S, 3): the noise that was taken off each sample, where the surface is a cleaned scan, else None. own_law: how often
+    that very noise is put back on; the laws of synthesis are met else.
+    """
+
+    points: Array
+    normals: Array
+    disc: float = 2.0 * (6.0 / N_DENSE) ** 0.5
+    residual: Array | None = None
+    own_law: float = 0.0
+
+
 @dataclass(frozen=True)
 class TrainingCloud:
     """One noisy cloud, ready for the network.
 
     seeds (M, 3), count (M,); raw (F, 3): points that land on the seeds. Where every point is its own seed, both are None.
-    surface (S, 3), normals (S, 3): the true surface. seed_judged (M,): seeds of the surface, far enough from the cut.
-    covered (C, 3), covered_normals (C, 3): samples of the surface that final points should come close to.
-    judged, clutter (F,): final points far enough from the cut, and those that belong to no surface and should stay.
-    noise: estimated standard deviation; scale: what errors are divided by.
+    seed_judged (M,): seeds of the surface, far enough from the cut. judged, clutter (F,): final points far enough from the cut,
+    and those that belong to no surface and should stay. noise: estimated standard deviation; scale: what errors are divided by.
+    surface: what predictions are held to, if anybody knows it; covered (C, 3), covered_normals (C, 3): samples of it that final
+    points should come close to, else none. held_out (H, 3): noisy points that the network does not see, else none.
     """
 
     seeds: Array
     count: Array | None
     raw: Array | None
-    surface: Array
-    normals: Array
-    covered: Array
-    covered_normals: Array
     seed_judged: Mask
     judged: Mask
     clutter: Mask
     noise: float
     scale: float
+    surface: Surface | None
+    covered: Array
+    covered_normals: Array
+    held_out: Array
 
     @property
     def n_points(self) -> int:
@@ -82,13 +100,95 @@ class TrainingCloud:
         return self.judged & ~self.clutter
 
 
-def draw_cloud(surface: Array, normals: Array, neighbours: int, rng: np.random.Generator) -> TrainingCloud:
-    """A noisy cloud of random density, noise law and level from the (S, 3) samples of a surface in the unit sphere."""
+PROCEDURAL = re.compile(r"shapes:([1-9]\d{0,5})")
+"""How a number of procedural surfaces is asked for, here and in `pcdenoise synth`."""
+
+Draw = Callable[[int, np.random.Generator], TrainingCloud]
+"""How a source gives a training cloud, for a network's number of neighbours; it can be sent to another process."""
+
+
+def from_surface(load: Callable[[], Surface], neighbours: int, rng: np.random.Generator) -> TrainingCloud:
+    """A cloud of the surface, turned at random, with its own density and noise."""
+    surface = load()
+    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    residual = None if surface.residual is None else surface.residual @ turn
+    return draw_cloud(
+        replace(surface, points=surface.points @ turn, normals=surface.normals @ turn, residual=residual), neighbours, rng
+    )
+
+
+def from_noisy(load: Callable[[], Array], neighbours: int, rng: np.random.Generator, *, judging: bool = False) -> TrainingCloud:
+    """A noisy cloud as it is, turned at random, some points held out: the network sees 40 to 70 % of them.
+
+    judging: it sees those that `learned_from` gives, and the others are held out.
+    """
+    points = load()
+    seen = _is_learned_from(points) if judging else rng.random(len(points)) < rng.uniform(0.4, 0.7)
+    points = points @ np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    clutter = np.zeros(int(seen.sum()), dtype=bool)
+    return _prepared(points[seen], clutter, 0.0, neighbours, rng, held_out=points[~seen])
+
+
+def learned_from(load: Callable[[], Array]) -> Array:
+    """(M, 3) three in four points of a noisy cloud, always the same; the rest are kept to judge by."""
+    points = load()
+    return points[_is_learned_from(points)]
+
+
+def _is_learned_from(points: Array) -> Mask:
+    learned_from: Mask = coordinate_hash(points, 0) >= np.uint64(2**62)
+    return learned_from
+
+
+def draw_cloud(surface: Surface, neighbours: int, rng: np.random.Generator) -> TrainingCloud:
+    """A noisy cloud of random density, noise law and level from samples of a surface in the unit sphere."""
+    if surface.residual is not None and rng.random() < surface.own_law:
+        noisy = _noisy_again(surface, rng)
+        kept = rng.random(len(noisy)) < rng.choice([1.0, rng.uniform(0.4, 1)])
+        return _prepared(noisy[kept], np.zeros(int(kept.sum()), dtype=bool), 0.0, neighbours, rng, surface=surface)
     n_points = int(np.exp(rng.uniform(np.log(4_000), np.log(150_000))))
     std = 0.0 if rng.random() < 0.04 else float(np.exp(rng.uniform(np.log(0.0015), np.log(0.036))))
-    clean, clutter = _with_clutter(surface[_sampling(surface, n_points, rng)], rng)
+    clean, clutter = _with_clutter(surface.points[_sampling(surface.points, n_points, rng)], rng)
     noisy, clutter = _with_outliers(_noise(clean, std, rng), clutter, rng)
+    return _prepared(noisy, clutter, std, neighbours, rng, surface=surface)
 
+
+def measured(surface: Surface, rng: np.random.Generator) -> Array:
+    """(N, 3) what a scanner would give of a surface: 30 to 120 thousand points with noise of one of the laws, no gross errors."""
+    n_points = int(np.exp(rng.uniform(np.log(30_000), np.log(120_000))))
+    std = float(np.exp(rng.uniform(np.log(0.0015), np.log(0.015))))
+    return _noise(surface.points[_sampling(surface.points, n_points, rng)], std, rng)
+
+
+def _noisy_again(surface: Surface, rng: np.random.Generator) -> Array:
+    """(S, 3) the samples with the residual of other samples, all the same way along the surface, so that what errs together, such
+    as the points of a beam, still does. Sign and strength are drawn."""
+    assert surface.residual is not None
+    points, normals = surface.points, surface.normals
+    away = rng.standard_normal(3)
+    slide = away - (normals @ away)[:, None] * normals
+    slide *= surface.disc * rng.uniform(2, 6) / np.linalg.norm(away)
+    near = knn(points, _LIKELY_OTHERS, points + slide, threads=1)[1]
+    other = near[np.arange(len(points)), rng.integers(near.shape[1], size=len(points))]
+    heights = (surface.residual[other] * normals[other]).sum(axis=1)
+    along = surface.residual[other] - heights[:, None] * normals[other]
+    same_side = np.sign((normals[other] * normals).sum(axis=1))
+    strength = rng.choice([-1.0, 1.0]) * np.exp(0.15 * rng.standard_normal())
+    noisy: Array = points + strength * ((heights * same_side)[:, None] * normals + along)
+    return noisy
+
+
+def _prepared(
+    noisy: Array,
+    clutter: Mask,
+    std: float,
+    neighbours: int,
+    rng: np.random.Generator,
+    *,
+    surface: Surface | None = None,
+    held_out: Array | None = None,
+) -> TrainingCloud:
+    """Seeds and landing points of (N, 3) noisy points, cut to a ball of what fits one step. std: 0 where nobody knows it."""
     level = estimate(noisy, threads=1)
     share = share_of_seeds(level, neighbours) * float(np.exp(0.15 * rng.standard_normal()))
     share = min(share, 1.0)
@@ -100,35 +200,37 @@ def draw_cloud(surface: Array, normals: Array, neighbours: int, rng: np.random.G
     kept = np.flatnonzero(distance < radius)
     kept = kept[spatial_order(noisy[kept])]
     noisy, clutter = noisy[kept], clutter[kept]
-    near = np.linalg.norm(surface - centre, axis=1) < radius + 0.2
 
-    def inside(points: Array) -> Mask:
-        judged: Mask = np.linalg.norm(points - centre, axis=1) < 0.75 * radius
-        return judged
+    def inside(points: Array, share: float = 0.75) -> Mask:
+        within: Mask = np.linalg.norm(points - centre, axis=1) < share * radius
+        return within
 
-    to_cover = np.flatnonzero(np.linalg.norm(surface - centre, axis=1) < 0.6 * radius)
-    to_cover = rng.permutation(to_cover)[:N_LANDING]
-    truth = surface[near], normals[near], surface[to_cover], normals[to_cover]
+    covered = covered_normals = np.zeros((0, 3))
+    if surface is not None:
+        to_cover = rng.permutation(np.flatnonzero(inside(surface.points, 0.6)))[:N_LANDING]
+        covered, covered_normals = surface.points[to_cover], surface.normals[to_cover]
+        near = np.linalg.norm(surface.points - centre, axis=1) < radius + 0.2
+        surface = replace(surface, points=surface.points[near], normals=surface.normals[near], residual=None)
+    held_out = np.zeros((0, 3)) if held_out is None else held_out[inside(held_out, 1.0)]
     estimated = level.std * float(np.exp(0.1 * rng.standard_normal()))
-    scale = max(std, 0.5 * level.std, 0.1 * level.spacing, 1e-6)
+    scale = max(std, 0.5 * level.std if std else level.std, 0.1 * level.spacing, 1e-6)
+    known = estimated, scale, surface, covered, covered_normals, held_out
     if share == 1:
         judged = inside(noisy)
-        return TrainingCloud(noisy, None, None, *truth, judged & ~clutter, judged, clutter, estimated, scale)
+        return TrainingCloud(noisy, None, None, judged & ~clutter, judged, clutter, *known)
     seeds = coarsen(noisy, share, seed=int(rng.integers(2**31)), threads=1)
     seed_judged = inside(seeds.points)
     if clutter.any():
         seed_judged &= cKDTree(noisy[clutter]).query(seeds.points)[0] > 2 * level.spacing
     landing = np.sort(rng.permutation(np.flatnonzero(inside(noisy)))[:N_LANDING])
     judged = np.ones(len(landing), dtype=bool)
-    return TrainingCloud(
-        seeds.points, seeds.count, noisy[landing], *truth, seed_judged, judged, clutter[landing], estimated, scale
-    )
+    return TrainingCloud(seeds.points, seeds.count, noisy[landing], seed_judged, judged, clutter[landing], *known)
 
 
 def _sampling(surface: Array, n_points: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Rows of the surface samples: uniform, or with a density that varies smoothly up to tenfold."""
     if rng.random() < 0.65:
-        return rng.choice(len(surface), size=n_points, replace=False)
+        return rng.choice(len(surface), size=min(n_points, len(surface)), replace=False)
     kept = noise.thin(surface, rng, contrast=rng.uniform(2, 10))
     return rng.choice(kept, size=min(n_points, len(kept)), replace=False)
 
@@ -174,64 +276,6 @@ def _with_outliers(noisy: Array, clutter: Mask, rng: np.random.Generator) -> tup
     return result, clutter | wrong
 
 
-Surfaces = list[Callable[[], tuple[Array, Array]]]
-"""Training surfaces, each a function that gives (S, 3) points and (S, 3) unit normals in the unit sphere."""
-
-PROCEDURAL = re.compile(r"shapes:([1-9]\d{0,5})")
-"""How a number of procedural surfaces is asked for, here and in `pcdenoise synth`."""
-
-
-def surfaces_from(data: Sequence[str], seed: int, cache: Path) -> list[Surfaces]:
-    """One list for each of `data`: `shapes:N`, N procedural surfaces; a mesh; all meshes in a folder, searched to the bottom.
-
-    Raises UsageError for data without a mesh. Samples are kept in the folder `cache`, since sampling a surface costs more than
-    learning from it.
-    """
-    return [_surfaces(text, seed, cache / str(number)) for number, text in enumerate(data)]
-
-
-def _surfaces(text: str, seed: int, cache: Path) -> Surfaces:
-    cache.mkdir()
-    if asked := PROCEDURAL.fullmatch(text):
-        return [partial(_cached, cache / f"{n}.npy", partial(_procedural, seed, n)) for n in range(int(asked[1]))]
-    path = Path(text)
-    if not path.exists():
-        raise ScanError(f"{text}: no such file or folder; check --data, or give shapes:400 for procedural surfaces")
-    meshes = [file for file in (sorted(path.rglob("*")) if path.is_dir() else [path]) if _is_mesh(file)]
-    if not meshes:
-        raise UsageError(
-            f"{text}: no mesh to learn from; give a folder of meshes, shapes:400, or a folder made by pcdenoise synth"
-        )
-    return [partial(_cached, cache / f"{n}.npy", partial(_from_mesh, file)) for n, file in enumerate(meshes)]
-
-
-def _is_mesh(path: Path) -> bool:
-    """By suffix; a PLY may as well be a point cloud and must say that it has faces."""
-    if path.suffix.lower() != ".ply":
-        return path.suffix.lower() in MESH_SUFFIXES
-    with path.open("rb") as file:
-        return b"element face" in file.read(8192)
-
-
-def _cached(path: Path, sample: Callable[[], tuple[Array, Array]]) -> tuple[Array, Array]:
-    if not path.exists():
-        part = path.with_suffix(".part.npy")
-        np.save(part, np.concatenate(sample(), axis=1).astype(np.float32))
-        part.replace(path)
-    both = np.load(path).astype(np.float64)
-    return both[:, :3], both[:, 3:]
-
-
-def _procedural(seed: int, number: int) -> tuple[Array, Array]:
-    sample = random_surface(np.random.default_rng([seed, number]), N_DENSE)
-    return sample.points, sample.normals
-
-
-def _from_mesh(path: Path) -> tuple[Array, Array]:
-    sample = sample_mesh(load_mesh(path), N_DENSE, np.random.default_rng(0))
-    return in_unit_sphere(sample.points), sample.normals
-
-
 CloudT = TypeVar("CloudT")
 
 
@@ -255,18 +299,13 @@ class CloudsAhead(ABC, Generic[CloudT]):
 
 
 class CloudSource(CloudsAhead[TrainingCloud]):
-    """Training clouds over some lists of surfaces, each list as often as the others.
+    """Training clouds from some lists of draws, each list as often as the others; the n-th depends on seed and n alone."""
 
-    The n-th cloud depends on seed and n alone.
-    """
-
-    def __init__(self, surfaces: list[Surfaces], seed: int) -> None:
-        self.surfaces, self.seed = surfaces, seed
+    def __init__(self, draws: Sequence[Sequence[Draw]], seed: int) -> None:
+        self.draws, self.seed = draws, seed
 
     def cloud(self, number: int, neighbours: int) -> TrainingCloud:
-        """The number-th cloud: one of the surfaces, turned at random, with its own density and noise."""
+        """The number-th cloud."""
         rng = np.random.default_rng([self.seed, 7, number])
-        surfaces = self.surfaces[int(rng.integers(len(self.surfaces)))]
-        surface, normals = surfaces[int(rng.integers(len(surfaces)))]()
-        turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
-        return draw_cloud(surface @ turn, normals @ turn, neighbours, rng)
+        draws = self.draws[int(rng.integers(len(self.draws)))]
+        return draws[int(rng.integers(len(draws)))](neighbours, rng)

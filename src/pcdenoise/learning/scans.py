@@ -71,7 +71,7 @@ def parts_from(config: TrainConfig, cache: Path) -> list[Part]:
     cut but the unit of length is its own diagonal.
     """
     found: list[Part] = []
-    for scan_path, clean_path in _files([Path(text) for text in config.data]):
+    for scan_path, clean_path in files_of([Path(text) for text in config.data]):
         scan = io.read(scan_path)
         finite = scan.finite
         rows = np.flatnonzero(finite)[distinct(scan.points[finite])[0]]
@@ -117,7 +117,7 @@ def _near(clean: Points, points: Points, radius: float) -> NDArray[np.bool_]:
     return near
 
 
-def _files(data: list[Path]) -> Iterator[tuple[Path, Path | None]]:
+def files_of(data: list[Path]) -> Iterator[tuple[Path, Path | None]]:
     """Every scan, and its clean counterpart where a data set names one."""
     for path in data:
         index = path / DATASET
@@ -137,7 +137,7 @@ def _files(data: list[Path]) -> Iterator[tuple[Path, Path | None]]:
 
 def noisy_and_clean(data: list[Path]) -> Iterator[tuple[Points, Points]]:
     """(N, 3) noisy and (M, 3) clean points of every pair in folders made by `pcdenoise synth`, the noisy ones' diagonal 1."""
-    for noisy_path, clean_path in _files(data):
+    for noisy_path, clean_path in files_of(data):
         if clean_path is None:
             continue
         noisy, clean = (scan.points[scan.finite] for scan in (io.read(noisy_path), io.read(clean_path)))

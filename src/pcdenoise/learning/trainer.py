@@ -1,6 +1,7 @@
 """The training loop: clouds in, a model folder out; stops on time or steps, saves as it goes, resumes.
 
-Not here: clouds (dataset.py), signals (supervised.py), the folder's format (networks.store).
+Not here: clouds (dataset.py, sources.py, scans.py), signals (supervised.py, split.py, distill.py, total.py), the folder's format
+(networks.store).
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import copy
 import json
 import math
 import os
+import shutil
 import tempfile
 import time
 from collections.abc import Callable
@@ -23,33 +25,47 @@ from torch import Tensor, nn
 
 from pcdenoise.config import TrainConfig
 from pcdenoise.errors import ModelError, UsageError, in_one_line
-from pcdenoise.learning.dataset import CloudsAhead, CloudSource, surfaces_from
+from pcdenoise.learning.dataset import Array, CloudsAhead, CloudSource, TrainingCloud, from_noisy, from_surface, learned_from
+from pcdenoise.learning.distill import distilled
 from pcdenoise.learning.scans import ScanSource, parts_from
+from pcdenoise.learning.sources import NoisyClouds, are_scans, noisy_from, surfaces_from
+from pcdenoise.learning.split import judge, split_loss
 from pcdenoise.learning.supervised import supervised_loss
 from pcdenoise.learning.total import total_loss
 from pcdenoise.networks import store
 from pcdenoise.networks.mcconv import MCConvConfig, MCConvNetwork
 from pcdenoise.networks.projection import ProjectionConfig, ProjectionNetwork
 
-CHECKPOINT, LOG = ".checkpoint.safetensors", "training.jsonl"
+CHECKPOINT, TEACHER, LOG = ".checkpoint.safetensors", ".teacher", "training.jsonl"
+FROM_NOTHING = "none"
+"""What `init` says where no model is to start from."""
 _SAVE_EVERY, _LOG_EVERY = 200, 50
 _DEFAULT_BUDGET_S = 20 * 60.0
 _AVERAGED_STEPS = 500  # the shipped weights are a running mean over about so many steps
 _WARM_UP_STEPS = 100
+_ADAPTING_RATE = 0.1  # of the peak learning rate, for a model that has learned already
+_OWN_LAW = {True: 0.8, False: 0.3}
+"""How often distillation puts back a scan's own noise and a synthetic cloud's, rather than a law of synthesis."""
+_JUDGED_CLOUDS = 16
 
 
 @dataclass(frozen=True)
 class TrainingSummary:
-    """What a run did. error: mean squared distance to the surface over squared noise in the last hundred steps."""
+    """What a run did. error: mean squared distance to the surface over squared noise in the last hundred steps.
+
+    verdict: which weights are kept after an adaptation, and why; else empty.
+    """
 
     steps: int
     points: int
     seconds: float
     error: float
+    verdict: str = ""
 
     def __str__(self) -> str:
         minutes = self.seconds / 60
-        return f"{self.steps} steps, {self.points / 1e6:.1f} M points, {minutes:.1f} min, error {self.error:.3f} of the noise"
+        done = f"{self.steps} steps, {self.points / 1e6:.1f} M points, {minutes:.1f} min, error {self.error:.3f} of the noise"
+        return f"{done}; {self.verdict}" if self.verdict else done
 
 
 def train(
@@ -63,45 +79,115 @@ def train(
     """Learns from the surfaces or scans in `config.data` and writes the model folder `output`.
 
     The folder also gets training.jsonl, one line per fifty steps. An interrupt (Ctrl-C) saves what was learned and is passed on.
+    Where split or distill learn from scans alone, the shipped model is adapted to them unless `init` says otherwise ("none": a
+    new network), and comes back as it was unless the change shows on a quarter of the points, which no step learns from.
     Raises UsageError when there is nothing to resume or to learn from.
     """
     if config.threads:
         torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
+    config, init, adapts = _settled(config, init)
     output.mkdir(parents=True, exist_ok=True)
     run = _Run(config, output, _initial(config, init))
+    before = copy.deepcopy(run.network) if adapts else None
     if resume:
         run.load()
     elif (output / CHECKPOINT).exists():
         raise UsageError(f"{output}: holds an unfinished run; give --resume to go on with it, or another folder")
-    with tempfile.TemporaryDirectory(prefix="pcdenoise-surfaces-") as cache:
-        source, signal = _lessons(config, Path(cache))
+    with tempfile.TemporaryDirectory(prefix="pcdenoise-clouds-") as cache:
+        lessons = _lessons(config, Path(cache), adapts)
         try:
-            for cloud in source.clouds(run.step, _neighbours(run.network)):
-                if run.progress >= 1:
-                    break
-                run.learn(signal, cloud)
-                if on_progress is not None:
-                    on_progress(f"step {run.step}, error {run.recent_error:.3f}", run.progress)
+            for lap in range(lessons.laps):
+                until = (lap + 1) / lessons.laps
+                if run.progress >= until:
+                    continue
+                for cloud in lessons.source(lap, run).clouds(run.step, _neighbours(run.network)):
+                    if run.progress >= until:
+                        break
+                    run.learn(lessons.signal, cloud)
+                    if on_progress is not None:
+                        on_progress(f"step {run.step}, error {run.recent_error:.3f}", run.progress)
+            if isinstance(before, ProjectionNetwork):
+                run.judge(before, _judges(config, Path(cache), before.config.neighbours))
         finally:
             run.save_model()
     (output / CHECKPOINT).unlink(missing_ok=True)
+    for teacher in output.glob(f"{TEACHER}-*"):
+        shutil.rmtree(teacher)
     return run.summary
+
+
+def _settled(config: TrainConfig, init: str | None) -> tuple[TrainConfig, str | None, bool]:
+    """The method, the starting model and the rate where they were left open, and whether a model is adapted to scans."""
+    scans = are_scans(config.data)
+    method = config.method or ("distill" if scans and not config.pairs and config.network == "projection" else "supervised")
+    if method in ("split", "distill") and config.network != "projection":
+        raise UsageError(f"--method {method}: trains the projection network alone; leave out --network {config.network}")
+    adapts = scans and method in ("split", "distill") and init != FROM_NOTHING
+    changes: dict[str, Any] = {"method": method}
+    if adapts:
+        init = init or store.DEFAULT
+        learned = store.load(init).network
+        if isinstance(learned, ProjectionNetwork):
+            changes["neighbours"] = learned.config.neighbours
+        changes["learning_rate"] = config.learning_rate or _ADAPTING_RATE * _PLANS["projection"].learning_rate
+    return config.model_copy(update=changes), init, adapts
 
 
 Signal = Callable[[Any, Any, float, np.random.Generator], tuple[Tensor, Tensor]]
 """From a network, a cloud, the progress from 0 to 1 and random numbers to the loss and to the error that is reported."""
 
 
-def _lessons(config: TrainConfig, cache: Path) -> tuple[CloudsAhead[Any], Signal]:
-    """What is learned from and how."""
+@dataclass(frozen=True)
+class _Lessons:
+    """What is learned from, lap after lap, and how. source: from the lap's number and the run to its clouds."""
+
+    source: Callable[[int, _Run], CloudsAhead[Any]]
+    signal: Signal
+    laps: int = 1
+
+
+def _lessons(config: TrainConfig, cache: Path, adapts: bool) -> _Lessons:
+    """By method: surfaces, noisy clouds with points held out, clouds that a teacher has cleaned, or targets from a prior."""
+    supervised: Signal = lambda network, cloud, _progress, _rng: supervised_loss(network, cloud)  # noqa: E731
+    if config.method == "distill":
+        return _Lessons(partial(_cleaned, _noisy(config, cache, adapts), cache), supervised, config.laps)
+    source: CloudsAhead[Any]
+    if config.method == "split":
+        draws = [[partial(from_noisy, load) for load in some] for some in _noisy(config, cache, adapts)]
+        source = CloudSource(draws, config.seed)
+        return _Lessons(lambda _lap, _run: source, lambda network, cloud, _progress, _rng: split_loss(network, cloud))
     if config.method == "supervised" and config.network == "projection" and not config.pairs:
         surfaces = surfaces_from(config.data, config.seed, cache)
-        return CloudSource(surfaces, config.seed), lambda network, cloud, _progress, _rng: supervised_loss(network, cloud)
-    signal: Signal = lambda network, cloud, progress, rng: total_loss(  # noqa: E731
-        network, cloud, progress, regulariser=config.regulariser, rng=rng
+        source = CloudSource([[partial(from_surface, load) for load in some] for some in surfaces], config.seed)
+        return _Lessons(lambda _lap, _run: source, supervised)
+    source = ScanSource(parts_from(config, cache), config)
+    return _Lessons(
+        lambda _lap, _run: source,
+        lambda network, cloud, progress, rng: total_loss(network, cloud, progress, regulariser=config.regulariser, rng=rng),
     )
-    return ScanSource(parts_from(config, cache), config), signal
+
+
+def _cleaned(noisy: list[NoisyClouds], cache: Path, lap: int, run: _Run) -> CloudSource:
+    """Clouds as what was learned so far cleans them; that teacher stays beside the checkpoint, for a run that is resumed."""
+    teacher = run.output / f"{TEACHER}-{lap}"
+    if not (teacher / store.CONFIG).exists():
+        store.save(run.average, teacher, summary=f"teacher of lap {lap}", training={}, scores={}, card="")
+    own_law = _OWN_LAW[are_scans(run.config.data)]
+    return CloudSource(distilled(noisy, teacher, cache / f"lap-{lap}", own_law), run.config.seed)
+
+
+def _noisy(config: TrainConfig, cache: Path, adapts: bool) -> list[list[Callable[[], Array]]]:
+    """Noisy clouds to learn from, without the points that an adapted model is judged by."""
+    noisy = noisy_from(config.data, config.seed, cache)
+    return [[partial(learned_from, load) for load in some] for some in noisy] if adapts else noisy
+
+
+def _judges(config: TrainConfig, cache: Path, neighbours: int) -> list[TrainingCloud]:
+    """Noisy clouds with the points held out that no step learned from, to compare weights by."""
+    noisy = noisy_from(config.data, config.seed, cache)
+    source = CloudSource([[partial(from_noisy, load, judging=True) for load in some] for some in noisy], config.seed + 1)
+    return [source.cloud(number, neighbours) for number in range(_JUDGED_CLOUDS)]
 
 
 def _neighbours(network: store.Network) -> int:
@@ -110,7 +196,7 @@ def _neighbours(network: store.Network) -> int:
 
 def _initial(config: TrainConfig, init: str | None) -> store.Network:
     """A new network, or one with the weights and sizes of another model; only the number of neighbours is free then."""
-    if init is not None:
+    if init is not None and init != FROM_NOTHING:
         learned = store.load(init).network
         if isinstance(learned, MCConvNetwork) != (config.network == "mcconv"):
             raise UsageError(f"--init {init}: not a {config.network} model; give --network to match it")
@@ -138,6 +224,7 @@ class _Run:
         self.optimiser = self._plan.optimiser(network.parameters(), lr=self._peak)
         self.step, self.points, self._before_s, self._began = 0, 0, 0.0, time.monotonic()
         self._errors: list[float] = []
+        self._verdict = ""
 
     @property
     def seconds(self) -> float:
@@ -159,7 +246,7 @@ class _Run:
     @property
     def summary(self) -> TrainingSummary:
         """The record so far."""
-        return TrainingSummary(self.step, self.points, self.seconds, self.recent_error)
+        return TrainingSummary(self.step, self.points, self.seconds, self.recent_error, self._verdict)
 
     def learn(self, signal: Signal, cloud: Any) -> None:
         """One step on one cloud; a cloud without judged points or with a loss that is no number teaches nothing."""
@@ -188,6 +275,18 @@ class _Run:
             self._log()
         if self.step % _SAVE_EVERY == 0:
             self.save()
+
+    def judge(self, before: ProjectionNetwork, clouds: list[TrainingCloud]) -> None:
+        """Goes back to the weights of `before` unless what was learned is better on held-out points, by two standard errors."""
+        old, new = judge(before, clouds), judge(self.average, clouds)
+        known = np.isfinite(old) & np.isfinite(new)
+        gain = old[known] - new[known]
+        better = len(gain) > 1 and gain.mean() > 2 * gain.std(ddof=1) / math.sqrt(len(gain))
+        if not better:
+            self.average.load_state_dict(before.state_dict())
+        means = [float(np.mean(errors[known])) if known.any() else math.nan for errors in (old, new)]
+        kept = "the adapted" if better else "the starting"
+        self._verdict = f"over held-out points {means[0]:.4f} before, {means[1]:.4f} after: {kept} weights are kept"
 
     def _log(self) -> None:
         line = {"step": self.step, "error": self.recent_error, "points": self.points, "seconds": round(self.seconds, 1)}
