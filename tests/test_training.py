@@ -126,7 +126,7 @@ def test_held_out_points_put_predictions_on_the_plane_from_either_side(offset):
     rng = np.random.default_rng(0)
     places = np.column_stack([rng.uniform(-0.7, 0.7, (2000, 2)), np.full(2000, offset)])
     height = _feet(_noisy_plane(rng), places)[:, 2]
-    # 20,000 points / (4 · area of a cylinder, some 60 points): fits around 2,000 places share points, so that about 200 are independent;
+    # 20,000 points / (4 · area of a cylinder, some 60 points): 2,000 fits share points, so that about 200 are independent;
     # each errs by 0.25 std.
     assert abs(height.mean()) < 4 * 0.3 * STD / np.sqrt(200)
 
@@ -138,7 +138,7 @@ def test_held_out_points_put_predictions_on_the_sphere_but_for_the_curvature_ter
     held_out /= np.linalg.norm(held_out, axis=1, keepdims=True)
     places *= (1 + offset) / np.linalg.norm(places, axis=1, keepdims=True)
     radius = np.linalg.norm(_feet(held_out + STD * rng.standard_normal(held_out.shape), places), axis=1)
-    # A fit to points that err along the surface too lies Hσ² too deep (H = 1 / radius), and a cylinder of finite height as much again.
+    # A fit to points that err along the surface lies Hσ² too deep (H = 1 / radius), and a cylinder of finite height as much again.
     assert -2.5 * STD**2 < radius.mean() - 1 < 0.5 * STD**2
 
 

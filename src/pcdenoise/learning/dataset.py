@@ -46,7 +46,7 @@ _LAWS = {
 
 
 _LIKELY_OTHERS = 6
-"""Residuals come from any of so many samples: were it the nearest, neighbours would share one and the noise would look smaller."""
+"""Residuals come from any of so many samples: with the nearest alone neighbours would share one, and noise would look smaller."""
 
 
 @dataclass(frozen=True)

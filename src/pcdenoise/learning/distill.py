@@ -42,7 +42,8 @@ def distilled(noisy: list[NoisyClouds], teacher: Path, cache: Path, own_law: flo
 
 def cleaned(points: Array, model: store.Model, own_law: float) -> Surface:
     """(N, 3) noisy points as a surface: the mean of the teacher's answers, normals, what was taken off."""
-    answers = [denoise(points, model, DenoiseConfig(seed=seed, threads=1, relax_steps=0)).points for seed in _SEEDS]
+    settings = [DenoiseConfig.model_validate({"seed": seed, "threads": 1, "relax_steps": 0}) for seed in _SEEDS]
+    answers = [denoise(points, model, one).points for one in settings]
     clean = np.mean(answers, axis=0)
     near = clean[knn(clean, _NORMAL_POINTS, threads=1)[1]]
     near -= near.mean(axis=1, keepdims=True)

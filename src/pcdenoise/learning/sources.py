@@ -53,6 +53,7 @@ def noisy_from(data: Sequence[str], seed: int, cache: Path) -> list[NoisyClouds]
     found: list[NoisyClouds] = []
     for number, text in enumerate(data):
         folder = _folder(cache / str(number))
+        clouds: Sequence[Callable[[], Array]]
         if PROCEDURAL.fullmatch(text) or (not (_existing(text) / DATASET).is_file() and _meshes(_existing(text))):
             surfaces = _surfaces(text, seed, folder)
             clouds = [partial(_measured, surface, [seed, 3, number, n]) for n, surface in enumerate(surfaces)]
@@ -122,7 +123,8 @@ def _kept(path: Path, make: Callable[[], Array]) -> Array:
         part = path.with_suffix(".part.npy")
         np.save(part, make().astype(np.float32))
         part.replace(path)
-    return np.load(path).astype(np.float64)
+    kept: Array = np.load(path).astype(np.float64)
+    return kept
 
 
 def _surface(path: Path, sample: Callable[[], Array]) -> Surface:

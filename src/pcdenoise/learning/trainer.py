@@ -278,6 +278,7 @@ class _Run:
 
     def judge(self, before: ProjectionNetwork, clouds: list[TrainingCloud]) -> None:
         """Goes back to the weights of `before` unless what was learned is better on held-out points, by two standard errors."""
+        assert isinstance(self.average, ProjectionNetwork)
         old, new = judge(before, clouds), judge(self.average, clouds)
         known = np.isfinite(old) & np.isfinite(new)
         gain = old[known] - new[known]
