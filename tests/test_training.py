@@ -138,7 +138,7 @@ def test_held_out_points_put_predictions_on_the_sphere_but_for_the_curvature_ter
     held_out /= np.linalg.norm(held_out, axis=1, keepdims=True)
     places *= (1 + offset) / np.linalg.norm(places, axis=1, keepdims=True)
     radius = np.linalg.norm(_feet(held_out + STD * rng.standard_normal(held_out.shape), places), axis=1)
-    # A fit to points that err along the surface lies Hσ² too deep (H = 1 / radius), and a cylinder of finite height as much again.
+    # A fit to points that err along the surface lies Hσ² too deep (H = 1 / radius), a cylinder of finite height as much again.
     assert -2.5 * STD**2 < radius.mean() - 1 < 0.5 * STD**2
 
 
