@@ -58,7 +58,8 @@ def main() -> None:
                 if name in PEERS and n <= LARGEST_FOR_PEERS:
                     np.save(cloud, np.concatenate(list(street(n))))
                     found = run([pythons.get(name, sys.executable), str(HERE / "peers.py"), name, str(cloud)])
-                    found |= json.loads(found.pop("stdout")) if found["exit_code"] == 0 else {}
+                    figures = [line for line in found.pop("stdout").splitlines() if line.startswith("{")]  # peers print too
+                    found |= json.loads(figures[0]) if found["exit_code"] == 0 else {}
                 elif name == OURS:
                     limit = ["--max-memory", options.max_memory] if options.max_memory else []
                     command = [sys.executable, "-m", "pcdenoise", "denoise", str(scan), "-o", str(Path(folder, "clean.laz"))]
