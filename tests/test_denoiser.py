@@ -337,10 +337,11 @@ def test_the_held_out_residual_is_noise_and_error_together(rng: np.random.Genera
     def denoised(half: np.ndarray) -> np.ndarray:
         return np.column_stack([half[:, :2], error * rng.standard_normal(len(half))])
 
-    # 10 000 points, each judged by four: known to one percent; cut at four std, the tails miss next to nothing.
-    assert held_out.after(denoised) == pytest.approx(np.hypot(noise, error), rel=0.02)
-    assert held_out.after(lambda half: half * [1, 1, 0]) == pytest.approx(noise, rel=0.02)
-    assert held_out.after(lambda half: half * [1, 1, 0] + [0, 0, 0.005]) == pytest.approx(np.hypot(noise, 0.005), rel=0.02)
+    # 10 000 points, each judged by four: a scatter of 0.7 % between halves. The level reads a tenth low and heights end at four
+    # of it, 3.1 stds of noise and error together, so that the tails miss 1.4 % more (both over 24 draws).
+    assert held_out.after(denoised) == pytest.approx(np.hypot(noise, error), rel=0.035)
+    assert held_out.after(lambda half: half * [1, 1, 0]) == pytest.approx(noise, rel=0.035)
+    assert held_out.after(lambda half: half * [1, 1, 0] + [0, 0, 0.005]) == pytest.approx(np.hypot(noise, 0.005), rel=0.035)
 
 
 # The paper's network
