@@ -21,8 +21,6 @@ from pcdenoise.networks import store
 
 _DISC_SPACINGS = 2.0
 _NORMAL_POINTS = 12
-_SEEDS = (0, 1)
-"""The teacher's answers are averaged over so many choices of seeds: its scatter from them is half of its error at most."""
 
 
 def distilled(noisy: list[NoisyClouds], teacher: Path, cache: Path, own_law: float) -> list[list[Draw]]:
@@ -41,10 +39,8 @@ def distilled(noisy: list[NoisyClouds], teacher: Path, cache: Path, own_law: flo
 
 
 def cleaned(points: Array, model: store.Model, own_law: float) -> Surface:
-    """(N, 3) noisy points as a surface: the mean of the teacher's answers, normals, what was taken off."""
-    settings = [DenoiseConfig.model_validate({"seed": seed, "threads": 1, "relax_steps": 0}) for seed in _SEEDS]
-    answers = [denoise(points, model, one).points for one in settings]
-    clean = np.mean(answers, axis=0)
+    """(N, 3) noisy points as a surface: the teacher's answer, normals, what was taken off."""
+    clean = denoise(points, model, DenoiseConfig.model_validate({"threads": 1, "relax_steps": 0})).points
     near = clean[knn(clean, _NORMAL_POINTS, threads=1)[1]]
     near -= near.mean(axis=1, keepdims=True)
     normals = np.linalg.eigh(near.transpose(0, 2, 1) @ near)[1][:, :, 0]

@@ -47,6 +47,8 @@ _ADAPTING_RATE = 0.1  # of the peak learning rate, for a model that has learned 
 _OWN_LAW = {True: 0.8, False: 0.3}
 """How often distillation puts back a scan's own noise and a synthetic cloud's, rather than a law of synthesis."""
 _JUDGED_CLOUDS = 16
+_FIRST_LAP = 0.2
+"""Share of a distillation whose teacher has learned nothing yet; the laps after it are equally long."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ def train(
         lessons = _lessons(config, Path(cache), adapts)
         try:
             for lap in range(lessons.laps):
-                until = (lap + 1) / lessons.laps
+                until = 1.0 if lap + 1 == lessons.laps else _FIRST_LAP + (1 - _FIRST_LAP) * lap / (lessons.laps - 1)
                 if run.progress >= until:
                     continue
                 for cloud in lessons.source(lap, run).clouds(run.step, _neighbours(run.network)):
