@@ -136,16 +136,16 @@ def descend(
         own, known = looking.around(stage)
         surface = surface if stages else trust(own, noise)
         features = known if features is None else features + known
-        move, features = looking.messages(stage, own, own, features, features, on_block)
+        move, features = looking.messages(stage, own, features, on_block)
         points = _numbers(points + move.double())
         stages.append(points)
     if raw is None or features is None:
         return Descent(stages, surface, None)
     seed_planes = _Looking(points, points, weights, k, noise, block_points, threads).planes()
     landing = torch.from_numpy(raw)
-    looking = _Looking(landing, points, weights, k, noise, block_points, threads)
-    own, known = looking.around(network.landing)
-    move, _ = looking.messages(network.landing, own, seed_planes, known, features, on_block)
+    move = _Looking(landing, points, weights, k, noise, block_points, threads).landing(
+        network.landing, seed_planes, features, on_block
+    )
     return Descent(stages, surface, _numbers(landing + move.double()))
 
 
@@ -200,27 +200,39 @@ class _Looking:
         normal, shape, known = self.over_blocks(look)
         return Planes(normal, shape), known
 
-    def messages(
-        self, stage: Stage, own: Planes, theirs: Planes, features: Tensor, sources: Tensor, on_block: Callable[[int], None]
-    ) -> tuple[Tensor, Tensor]:
-        """(M, 3) moves and (M, C) features after all rounds of a stage; among themselves, points hear of each other's news."""
-        among = sources is features
+    def messages(self, stage: Stage, planes: Planes, features: Tensor, on_block: Callable[[int], None]) -> tuple[Tensor, Tensor]:
+        """(M, 3) moves and (M, C) features after all rounds of a stage, one by one: points hear of each other's news."""
         move = torch.zeros(0)
         for number, layer in enumerate(stage.exchanges, start=1):
             last = number == len(stage.exchanges)
-            heard = layer.hear(features if among else sources)
+            heard = layer.hear(features)
             before = features
 
             def exchange(block: slice, graph: Edges) -> tuple[Tensor, ...]:
-                mine = own.block(block)
-                edge, a, b = self._features(graph, mine, theirs)
+                mine = planes.block(block)
+                edge, a, b = self._features(graph, mine, planes)
                 message, news = layer(edge, graph, before[block], heard)  # noqa: B023
                 on_block(block.stop - block.start)
-                return (news, stage.step(message, graph, mine, theirs, a, b)) if last else (news,)  # noqa: B023
+                return (news, stage.step(message, graph, mine, planes, a, b)) if last else (news,)  # noqa: B023
 
             features, *moves = self.over_blocks(exchange)
             move = moves[0] if last else move
         return move, features
+
+    def landing(self, stage: Stage, theirs: Planes, sources: Tensor, on_block: Callable[[int], None]) -> Tensor:
+        """(M, 3) moves of points that hear of sources alone, whose planes and features (N, C) stay: a block does all rounds."""
+        heard = [layer.hear(sources) for layer in stage.exchanges]
+
+        def land(block: slice, graph: Edges) -> tuple[Tensor]:
+            mine = planes(graph)
+            features = stage.embed(point_features(graph, mine, self.noise))
+            edge, a, b = edge_features(graph, mine, theirs, self.noise)
+            for layer, said in zip(stage.exchanges, heard, strict=True):
+                message, features = layer(edge, graph, features, said)
+                on_block(block.stop - block.start)
+            return (stage.step(message, graph, mine, theirs, a, b),)
+
+        return self.over_blocks(land)[0]
 
     def _features(self, graph: Edges, mine: Planes, theirs: Planes) -> tuple[Tensor, Tensor, Tensor]:
         if not self.in_one:

@@ -39,7 +39,8 @@ def exchange(
     features (M, K, F) of the edges; own (M, C); heard (N, C), read at source (M, K); weight (M, K) of sum one; first (C, F) and
     (C,), second (C, C) and (C,): the layers' weights and biases. No gradient reaches `weight`.
     """
-    return Pooled(*_Exchange.apply(features, own, heard, source, weight, *first, *second))  # type: ignore[no-untyped-call]
+    learning = torch.is_grad_enabled()  # not known inside
+    return Pooled(*_Exchange.apply(learning, features, own, heard, source, weight, *first, *second))  # type: ignore[no-untyped-call]
 
 
 def _parts(n: int) -> Iterator[slice]:
@@ -49,23 +50,25 @@ def _parts(n: int) -> Iterator[slice]:
 class _Exchange(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, features: Tensor, own: Tensor, heard: Tensor, source: Tensor, weight: Tensor,
+        ctx: Any, learning: bool, features: Tensor, own: Tensor, heard: Tensor, source: Tensor, weight: Tensor,
         weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         (m, k, _), c = features.shape, own.shape[1]
-        hidden, message = own.new_empty(m, k, c), own.new_empty(m, k, c)
+        hidden, message = own.new_empty(m if learning else min(m, _ROWS), k, c), own.new_empty(m, k, c)
         mean, most = own.new_empty(m, c), own.new_empty(m, c)
         share = weight / weight.amax(-1, keepdim=True).clamp_min(1e-12)
         for part in _parts(m):
-            before, after = hidden[part].view(-1, c), message[part].view(-1, c)
+            at_edges = hidden[part] if learning else hidden[: part.stop - part.start]
+            before, after = at_edges.view(-1, c), message[part].view(-1, c)
             torch.mm(features[part].flatten(0, 1), weight1.t(), out=before)
-            hidden[part].add_((own[part] + bias1)[:, None])
+            at_edges.add_((own[part] + bias1)[:, None])
             before.add_(heard.index_select(0, source[part].flatten())).relu_()
             torch.mm(before, weight2.t(), out=after)
             after.add_(bias2).relu_()
             mean[part] = torch.bmm(weight[part, None], message[part])[:, 0]
             most[part] = (message[part] * share[part, :, None]).amax(1)
-        ctx.save_for_backward(features, source, weight, share, weight1, weight2, hidden, message, most)
+        if learning:
+            ctx.save_for_backward(features, source, weight, share, weight1, weight2, hidden, message, most)
         ctx.n_sources = len(heard)
         ctx.set_materialize_grads(False)
         return message, mean, most
@@ -80,7 +83,7 @@ class _Exchange(torch.autograd.Function):
         of_weight1, of_weight2 = torch.zeros_like(weight1), torch.zeros_like(weight2)
         of_bias2 = weight1.new_zeros(c)
         of_own, of_heard = most.new_empty(m, c), most.new_zeros(ctx.n_sources, c)
-        of_features = torch.empty_like(features) if ctx.needs_input_grad[0] else None
+        of_features = torch.empty_like(features) if ctx.needs_input_grad[1] else None
         for part in _parts(m):
             before, after = hidden[part].view(-1, c), message[part].view(-1, c)
             relative = share[part, :, None]
@@ -98,4 +101,4 @@ class _Exchange(torch.autograd.Function):
             of_heard.index_add_(0, source[part].flatten(), flat)
             if of_features is not None:
                 torch.mm(flat, weight1, out=of_features[part].view(-1, f))
-        return of_features, of_own, of_heard, None, None, of_weight1, of_own.sum(0), of_weight2, of_bias2
+        return None, of_features, of_own, of_heard, None, None, of_weight1, of_own.sum(0), of_weight2, of_bias2
