@@ -52,7 +52,7 @@ def main() -> int:
     parser.add_argument("--shards", type=int, default=4, help="processes at a time")
     parser.add_argument("--kills", type=int, default=8)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("options", nargs="*", help="for pcdenoise denoise, after --")
+    parser.add_argument("--options", type=str.split, default=[], help="for pcdenoise denoise: --options='--method mean'")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         figures = (survey if given.what == "survey" else kills)(given, Path(folder))
@@ -151,8 +151,7 @@ def _until_done(
             moments.pop(0)
             os.kill(rng.choice(list(running)), signal.SIGKILL)
             cost.kills += 1
-        cells = (path.stat for path in target.glob(".*.cells/*/*") if path.suffix != ".part") if target.exists() else ()
-        cost.cell_bytes = max(cost.cell_bytes, sum(_size(stat) for stat in cells) // len(commands))
+        cost.cell_bytes = max(cost.cell_bytes, _cell_bytes(target) // len(commands))
         for pid in list(running):
             ended, status, usage = os.wait4(pid, os.WNOHANG)
             if ended:
@@ -166,9 +165,10 @@ def _until_done(
         time.sleep(_LOOK_EVERY_S)
 
 
-def _size(stat: Any) -> int:
+def _cell_bytes(target: Path) -> int:
+    """What the cells below a folder take; those that go while they are looked at do not count."""
     try:
-        return int(stat().st_size)
+        return sum(path.stat().st_size for path in target.glob(".*.cells/*/*"))
     except FileNotFoundError:
         return 0
 
