@@ -49,6 +49,7 @@ def main() -> None:
     options = parser.parse_args()
     pythons = dict(pair.split("=", 1) for pair in options.peer_python)
     rows: list[dict[str, Any]] = []
+    load_before = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as folder:
         for size in QUICK if options.quick else options.sizes:
             n = int(float(size[:-1]) * {"K": 1e3, "M": 1e6}[size[-1].upper()])
@@ -74,7 +75,7 @@ def main() -> None:
             rows.append(report(TRAIN, steps, found, "clouds"))
     options.output.mkdir(parents=True, exist_ok=True)
     machine = {"cpu": cpu_name(), "cores": os.cpu_count(), "python": platform.python_version(), "system": platform.platform()}
-    done = {"pcdenoise": __version__, "machine": machine, "load_before": os.getloadavg()[0], "rows": rows}
+    done = {"pcdenoise": __version__, "machine": machine, "load_before": load_before, "rows": rows}
     (options.output / "speed.json").write_text(json.dumps(done, indent=1) + "\n")
     write_png(options.output / "speed.png", picture(rows), overwrite=True)
 

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 
 NEIGHBOURS = 24
+AROUND = object()
+"""Stands for these neighbours among a smoother's arguments."""
 
 
 def cgal_jet(points: np.ndarray) -> Callable[[], Any]:
@@ -33,14 +35,17 @@ def _open3d(points: np.ndarray) -> Any:
     return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
 
 
-def open3d_statistical(points: np.ndarray) -> Callable[[], Any]:
-    cloud = _open3d(points)
-    return lambda: cloud.remove_statistical_outlier(NEIGHBOURS, 2.0)
+def _open3d_smoother(name: str, *arguments: Any) -> Callable[[np.ndarray], Callable[[], Any]]:
+    """One of Open3D 0.20's smoothers, with 24 neighbours as the others have; its radii are in metres, for the street."""
 
+    def prepared(points: np.ndarray) -> Callable[[], Any]:
+        import open3d
 
-def open3d_radius(points: np.ndarray) -> Callable[[], Any]:
-    cloud = _open3d(points)
-    return lambda: cloud.remove_radius_outlier(NEIGHBOURS // 2, 0.15)
+        cloud = _open3d(points)
+        around = open3d.geometry.KDTreeSearchParamKNN(NEIGHBOURS)
+        return lambda: getattr(cloud, name)(*(around if argument is AROUND else argument for argument in arguments))
+
+    return prepared
 
 
 def scipy_knn(points: np.ndarray) -> Callable[[], Any]:
@@ -49,7 +54,14 @@ def scipy_knn(points: np.ndarray) -> Callable[[], Any]:
     return lambda: cKDTree(points).query(points, k=NEIGHBOURS, workers=-1)
 
 
-PEERS = {"CGAL jet": cgal_jet, "Open3D statistical": open3d_statistical, "Open3D radius": open3d_radius, "scipy kNN": scipy_knn}
+PEERS = {
+    "CGAL jet": cgal_jet,
+    "Open3D MLS": _open3d_smoother("smooth_mls", AROUND),
+    "Open3D bilateral": _open3d_smoother("smooth_bilateral", AROUND, 0.1, 0.06),
+    "Open3D Laplacian": _open3d_smoother("smooth_laplacian", 1, 0.5, NEIGHBOURS),
+    "Open3D Taubin": _open3d_smoother("smooth_taubin", 1, 0.5, -0.53, NEIGHBOURS),
+    "scipy kNN": scipy_knn,
+}
 
 if __name__ == "__main__":
     points = np.load(sys.argv[2])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import time
 from dataclasses import dataclass, field
 from functools import partial
@@ -120,26 +121,33 @@ def denoise(
         unshrink=unshrink, neighbours=neighbours, radius=radius, sigma_d=sigma_d, sigma_n=sigma_n, seed=seed, threads=threads,
     )  # fmt: skip
     console, sources = Console(quiet, verbose), expand(inputs)
-    if shard:
-        sources = files.shard(sources, shard)
+    share = files.shard(sources, shard) if shard else sources
     if dry_run:
-        print(_plan_text(sources, output, suffix, format, settings))
+        print(_plan_text(share, output, suffix, format, settings))
         return
     if not output:
         raise UsageError("-o is missing; say where the result goes: -o clean.las, -o folder/ or -o -")
     run = workers_.chosen(workers, engine, scheduler)
-    if workers > 1:
-        settings = settings.model_copy(update={"threads": settings.threads or max(1, (os.cpu_count() or 1) // workers)})
-    jobs = plan(sources, output, suffix=suffix, format=format) if sources else []
-    pictures = {job.source: job.target for job in plan(sources, str(picture), format="png")} if picture else {}
-    if resume:
-        jobs = [job for job in jobs if job.target == STREAM or not job.target.exists()]
-        pictures = {job.source: pictures[job.source] for job in jobs if job.source in pictures}
+    is_far = run is not workers_.here
+    if is_far:
+        n_threads = 1 if engine == "dask" else max(1, (os.cpu_count() or 1) // workers)
+        settings = settings.model_copy(update={"threads": settings.threads or n_threads})
+    jobs = plan(sources, output, suffix=suffix, format=format, share=share)
+    drawn = plan(sources, str(picture), format="png", share=share) if picture else []
+    if is_far and any(STREAM in (job.source, job.target) for job in jobs):
+        raise UsageError("-: workers have neither standard input nor output; name files, or leave --workers and --engine out")
+    if engine == "dask":
+        jobs, drawn = files.absolute(jobs), files.absolute(drawn)
+    done = [job for job in jobs if resume and job.target != STREAM and job.target.exists()]
+    jobs = [job for job in jobs if job not in done]
+    pictures = {picture.source: picture.target for picture in drawn if picture.source in {job.source for job in jobs}}
     refuse_existing([*(job.target for job in jobs), *pictures.values(), report], overwrite or resume)
+    for job in done if resume else jobs:
+        shutil.rmtree(_cells_of(job), ignore_errors=True)
     chosen = selection.Selection.of(only_class, context, roi)
     cleaning = _Cleaning(
-        settings, chosen, chosen_model(model, settings), console, format, overwrite, drop_attributes, displacement, max_drift,
-        pictures, n_bytes(max_memory) // workers, tile, resume,
+        settings, chosen, chosen_model(model, settings), console, format, overwrite or is_far, drop_attributes, displacement,
+        max_drift, pictures, n_bytes(max_memory) // workers, tile,
     )  # fmt: skip
     batch = Batch(console)
     batch.run(jobs, cleaning.clean, run)
@@ -160,9 +168,17 @@ def chosen_model(name: str | None, settings: DenoiseConfig) -> Model | None:
     return store.load(name) if name else store.load()
 
 
+def _cells_of(job: Job) -> Path:
+    """The folder where a scan's cells lie while it is cleaned; whoever cleans it goes on with what is there already."""
+    return job.target.with_name(f".{job.target.name}.cells")
+
+
 @dataclass(frozen=True)
 class _Cleaning:
-    """What is the same for every scan of a run: how to clean, what to write, and pages of the last scan for its report."""
+    """What is the same for every scan of a run: how to clean, what to write, and pages of the last scan for its report.
+
+    overwrite: also where workers may be lost, since a target that is there then is that of a worker that was.
+    """
 
     config: DenoiseConfig
     selection: selection.Selection
@@ -176,7 +192,6 @@ class _Cleaning:
     pictures: dict[Path, Path]
     max_bytes: int
     tile: int | None = None
-    resume: bool = False
     pages: list[Page] = field(default_factory=list)
 
     @property
@@ -220,14 +235,12 @@ class _Cleaning:
                 )
         cell_points = self.tile or points_per_cell(self.max_bytes)
         job.target.parent.mkdir(parents=True, exist_ok=True)
-        folder = job.target.with_name(f".{job.target.name}.cells")
+        folder = _cells_of(job)
         about = job.source.stat()
         tiles = Tiles(
             folder, lambda: (piece.points for piece in stream.pieces(_PIECE_ROWS)), self.model, self.config, cell_points,
             {"source": str(job.source.resolve()), "size": about.st_size, "changed": about.st_mtime_ns},
         )  # fmt: skip
-        if not self.resume:
-            tiles.remove()
         self.console.detail(f"{job.source}: {stream.n_points:,} points in cells of {cell_points:,}, kept in {folder}")
         with self.console.progress(job.source.name) as on_progress:
             tiles.run(on_progress)

@@ -6,7 +6,7 @@ import glob
 import heapq
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -95,24 +95,33 @@ def shard(sources: Sequence[Path], text: str) -> list[Path]:
     return [source for source in sources if source in of_job[int(asked[1]) - 1]]
 
 
-def plan(sources: Sequence[Path], output: str, *, suffix: str = "", format: str | None = None) -> list[Job]:
+def plan(
+    sources: Sequence[Path], output: str, *, suffix: str = "", format: str | None = None, share: Collection[Path] | None = None
+) -> list[Job]:
     """One target for each source: the output itself for one source, a file of the same name in the output folder for several.
 
-    suffix goes between name and extension; format, where given, sets the extension. Raises UsageError if two results would
-    meet in one file, or several in what is not a folder.
+    suffix goes between name and extension; format, where given, sets the extension. share: the sources that are wanted, where
+    others see to the rest. Raises UsageError if two results, of whatever share, would meet in one file, or several in what is
+    not a folder.
     """
+    wanted = set(sources if share is None else share)
     folder = output.endswith(("/", "\\")) or Path(output).is_dir()
     if not folder:
         if len(sources) > 1:
             raise UsageError(f"-o {output}: {len(sources)} inputs need a folder; end the name with a slash: -o {output}/")
-        return [Job(sources[0], Path(output))]
+        return [Job(source, Path(output)) for source in sources if source in wanted]
     jobs = [Job(source, Path(output) / _target_name(source, suffix, format)) for source in sources]
     by_target: dict[Path, Path] = {}
     for job in jobs:
         other = by_target.setdefault(job.target, job.source)
         if other != job.source:
             raise UsageError(f"-o {output}: {other} and {job.source} would both become {job.target}; clean them into two folders")
-    return jobs
+    return [job for job in jobs if job.source in wanted]
+
+
+def absolute(jobs: Sequence[Job]) -> list[Job]:
+    """The jobs for someone who works in another folder."""
+    return [Job(job.source.absolute(), job.target.absolute()) for job in jobs]
 
 
 def _target_name(source: Path, suffix: str, format: str | None) -> str:

@@ -82,7 +82,7 @@ def train(
     Example: pcdenoise train -o my_model --budget 20m
     """
     from pcdenoise.config import TrainConfig
-    from pcdenoise.learning import trainer
+    from pcdenoise.learning import ranks, trainer
 
     settings = configured(
         TrainConfig, data=data, method=method, network=network, pairs=pairs, neighbours=neighbours, learning_rate=learning_rate,
@@ -91,10 +91,10 @@ def train(
     )  # fmt: skip
     refuse_existing([output / "config.json"], overwrite or resume)
     refuse_existing([report], overwrite)
-    console = Console(quiet)
+    console = Console(quiet or not ranks.is_first())
     with console.progress("train") as on_progress:
         summary = trainer.train(settings, output, init=init, resume=resume, on_progress=on_progress)
-    if report:
+    if report and ranks.is_first():
         _save_report(report, output, settings.model_dump(mode="json"), asdict(summary), overwrite)
     console.note(f"{output}: {summary}")
 

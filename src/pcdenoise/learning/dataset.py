@@ -290,12 +290,12 @@ class CloudsAhead(ABC, Generic[CloudT]):
     def cloud(self, number: int, neighbours: int) -> CloudT:
         """The number-th cloud; it depends on nothing but the source and these."""
 
-    def clouds(self, first: int, neighbours: int, ahead: int = 6) -> Iterator[CloudT]:
-        """Endless clouds from the first-th on."""
+    def clouds(self, first: int, neighbours: int, ahead: int = 6, stride: int = 1) -> Iterator[CloudT]:
+        """Endless clouds from the first-th on, every stride-th."""
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as makers:
-            waiting = deque(makers.submit(self.cloud, first + i, neighbours) for i in range(ahead))
+            waiting = deque(makers.submit(self.cloud, first + i * stride, neighbours) for i in range(ahead))
             try:
-                for number in count(first + ahead):
+                for number in count(first + ahead * stride, stride):
                     yield waiting.popleft().result()
                     waiting.append(makers.submit(self.cloud, number, neighbours))
             finally:

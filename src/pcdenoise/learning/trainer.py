@@ -27,6 +27,7 @@ from pcdenoise.config import TrainConfig
 from pcdenoise.errors import ModelError, UsageError, in_one_line
 from pcdenoise.learning.dataset import Array, CloudsAhead, CloudSource, TrainingCloud, from_noisy, from_surface, learned_from
 from pcdenoise.learning.distill import distilled
+from pcdenoise.learning.ranks import Ranks, joined
 from pcdenoise.learning.scans import ScanSource, parts_from
 from pcdenoise.learning.sources import NoisyClouds, are_scans, noisy_from, surfaces_from
 from pcdenoise.learning.split import judge, split_loss
@@ -83,6 +84,7 @@ def train(
     The folder also gets training.jsonl, one line per fifty steps. An interrupt (Ctrl-C) saves what was learned and is passed on.
     Where split or distill learn from scans alone, the shipped model is adapted to them unless `init` says otherwise ("none": a
     new network), and comes back as it was unless the change shows on a quarter of the points, which no step learns from.
+    Under torchrun each process learns from clouds of its own, gradients are averaged, and the first process writes.
     Raises UsageError when there is nothing to resume or to learn from.
     """
     if config.threads:
@@ -90,7 +92,12 @@ def train(
     torch.manual_seed(config.seed)
     config, init, adapts = _settled(config, init)
     output.mkdir(parents=True, exist_ok=True)
-    run = _Run(config, output, _initial(config, init))
+    with joined() as ranks:
+        return _trained(_Run(config, output, _initial(config, init), ranks), adapts, resume, on_progress)
+
+
+def _trained(run: _Run, adapts: bool, resume: bool, on_progress: Callable[[str, float], None] | None) -> TrainingSummary:
+    config, output, ranks = run.config, run.output, run.ranks
     before = copy.deepcopy(run.network) if adapts else None
     if resume:
         run.load()
@@ -103,19 +110,23 @@ def train(
                 until = 1.0 if lap + 1 == lessons.laps else _FIRST_LAP + (1 - _FIRST_LAP) * lap / (lessons.laps - 1)
                 if run.progress >= until:
                     continue
-                for cloud in lessons.source(lap, run).clouds(run.step, _neighbours(run.network)):
+                for cloud in lessons.source(lap, run).clouds(
+                    ranks.number(run.step), _neighbours(run.network), stride=ranks.count
+                ):
                     if run.progress >= until:
                         break
                     run.learn(lessons.signal, cloud)
                     if on_progress is not None:
                         on_progress(f"step {run.step}, error {run.recent_error:.3f}", run.progress)
-            if isinstance(before, ProjectionNetwork):
+            if isinstance(before, ProjectionNetwork) and ranks.is_first:
                 run.judge(before, _judges(config, Path(cache), before.config.neighbours))
         finally:
-            run.save_model()
-    (output / CHECKPOINT).unlink(missing_ok=True)
-    for teacher in output.glob(f"{TEACHER}-*"):
-        shutil.rmtree(teacher)
+            if ranks.is_first:
+                run.save_model()
+    if ranks.is_first:
+        (output / CHECKPOINT).unlink(missing_ok=True)
+        for teacher in output.glob(f"{TEACHER}-*"):
+            shutil.rmtree(teacher)
     return run.summary
 
 
@@ -173,8 +184,9 @@ def _lessons(config: TrainConfig, cache: Path, adapts: bool) -> _Lessons:
 def _cleaned(noisy: list[NoisyClouds], cache: Path, lap: int, run: _Run) -> CloudSource:
     """Clouds as what was learned so far cleans them; that teacher stays beside the checkpoint, for a run that is resumed."""
     teacher = run.output / f"{TEACHER}-{lap}"
-    if not (teacher / store.CONFIG).exists():
+    if run.ranks.is_first and not (teacher / store.CONFIG).exists():
         store.save(run.average, teacher, summary=f"teacher of lap {lap}", training={}, scores={}, card="")
+    run.ranks.wait()
     own_law = _OWN_LAW[are_scans(run.config.data)]
     return CloudSource(distilled(noisy, teacher, cache / f"lap-{lap}", own_law), run.config.seed)
 
@@ -218,8 +230,8 @@ def _initial(config: TrainConfig, init: str | None) -> store.Network:
 class _Run:
     """Weights, their running mean, the optimiser and the record of one training run."""
 
-    def __init__(self, config: TrainConfig, output: Path, network: store.Network) -> None:
-        self.config, self.output, self.network = config, output, network
+    def __init__(self, config: TrainConfig, output: Path, network: store.Network, ranks: Ranks) -> None:
+        self.config, self.output, self.network, self.ranks = config, output, network, ranks
         self.average = copy.deepcopy(network)
         self._plan = _PLANS[config.network]
         self._peak = config.learning_rate or self._plan.learning_rate
@@ -235,10 +247,10 @@ class _Run:
 
     @property
     def progress(self) -> float:
-        """Share of the budget or the steps that is spent."""
+        """Share of the budget or the steps that is spent, by the first process's clock; all processes must ask together."""
         by_steps = self.step / self.config.steps if self.config.steps else 0.0
         budget_s = self.config.budget_s or (None if self.config.steps else _DEFAULT_BUDGET_S)
-        return max(by_steps, self.seconds / budget_s if budget_s else 0.0)
+        return max(by_steps, self.ranks.agreed(self.seconds) / budget_s if budget_s else 0.0)
 
     @property
     def recent_error(self) -> float:
@@ -251,18 +263,19 @@ class _Run:
         return TrainingSummary(self.step, self.points, self.seconds, self.recent_error, self._verdict)
 
     def learn(self, signal: Signal, cloud: Any) -> None:
-        """One step on one cloud; a cloud without judged points or with a loss that is no number teaches nothing."""
+        """One step on one cloud a process; one without judged points or with a loss that is no number teaches nothing."""
         self.step += 1
-        if not cloud.n_points:
+        progress = self.progress
+        self.optimiser.zero_grad()
+        errors = self._differentiate(signal, cloud, progress)
+        shared = [_gradient(parameter) for parameter in self.network.parameters()] if self.ranks.count > 1 else []
+        shared += [buffer for buffer in self.network.buffers() if buffer.is_floating_point()]
+        figures = [sum(errors), cloud.n_points if errors else 0]
+        error, n_points, n_taught = self.ranks.averaged(shared, figures, len(errors))
+        if not n_taught:
             return
         for group in self.optimiser.param_groups:
-            group["lr"] = self._peak * self._plan.rate(self.step, self.progress)
-        rng = np.random.default_rng([self.config.seed, 17, self.step])
-        loss, error = signal(self.network, cloud, min(self.progress, 1.0), rng)
-        if not torch.isfinite(loss):
-            return
-        self.optimiser.zero_grad()
-        torch.autograd.backward(loss)
+            group["lr"] = self._peak * self._plan.rate(self.step, progress)
         nn.utils.clip_grad_norm_(self.network.parameters(), self._plan.clip)
         self.optimiser.step()
         keep = min(1 - 1 / _AVERAGED_STEPS, self.step / (self.step + 10)) if self._plan.is_averaged else 0.0
@@ -271,12 +284,23 @@ class _Run:
                 slow.lerp_(fast, 1 - keep)
             for kept, current in zip(self.average.buffers(), self.network.buffers(), strict=True):
                 kept.copy_(current)
-        self._errors = [*self._errors[-99:], float(error.detach())]
-        self.points += cloud.n_points
-        if self.step % _LOG_EVERY == 0:
+        self._errors = [*self._errors[-99:], error / n_taught]
+        self.points += int(n_points)
+        if self.step % _LOG_EVERY == 0 and self.ranks.is_first:
             self._log()
-        if self.step % _SAVE_EVERY == 0:
+        if self.step % _SAVE_EVERY == 0 and self.ranks.is_first:
             self.save()
+
+    def _differentiate(self, signal: Signal, cloud: Any, progress: float) -> list[float]:
+        """Leaves the gradient of this process's cloud in the network; gives its error, or nothing if it teaches nothing."""
+        if not cloud.n_points:
+            return []
+        rng = np.random.default_rng([self.config.seed, 17, self.ranks.number(self.step)])
+        loss, error = signal(self.network, cloud, min(progress, 1.0), rng)
+        if not torch.isfinite(loss):
+            return []
+        torch.autograd.backward(loss)
+        return [float(error.detach())]
 
     def judge(self, before: ProjectionNetwork, clouds: list[TrainingCloud]) -> None:
         """Goes back to the weights of `before` unless what was learned is better on held-out points, by two standard errors."""
@@ -353,6 +377,13 @@ class _Run:
             f"# {self.output.resolve().name}\n\nA {self.config.network} network trained with pcdenoise: {self.summary}.\n\n"
             f"| setting | value |\n| --- | --- |\n{rows}\n\nThe curve is in {LOG}.\n"
         )
+
+
+def _gradient(parameter: nn.Parameter) -> Tensor:
+    """The gradient to be averaged with others', zero where this process has none."""
+    if parameter.grad is None:
+        parameter.grad = torch.zeros_like(parameter)
+    return parameter.grad
 
 
 def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
