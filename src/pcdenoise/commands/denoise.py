@@ -16,7 +16,7 @@ from pcdenoise.commands.console import Console, figure, table
 from pcdenoise.commands.files import STREAM, Job, expand, format_of, plan, refuse_existing
 from pcdenoise.commands.memory import n_bytes
 from pcdenoise.commands.options import configured, option
-from pcdenoise.commands.undo import with_displacement
+from pcdenoise.commands.undo import with_displacement, with_uncertainty
 from pcdenoise.commands.verify import MaxDrift, check_drift
 from pcdenoise.errors import UsageError
 
@@ -71,6 +71,9 @@ def denoise(
     displacement: Annotated[
         bool, option("--displacement", help="Store where each point was and how far it moved; undo needs it.")
     ] = False,
+    uncertainty: Annotated[
+        bool, option("--uncertainty", help="Store how far each point may still be off: a standard deviation, in the file's unit.")
+    ] = False,
     max_memory: Annotated[
         str | None,
         option("--max-memory", metavar="SIZE", help="Never hold more than this: 800M, 2G; half of what is free if not given."),
@@ -117,7 +120,8 @@ def denoise(
 
     settings = configured(
         DenoiseConfig, method=method, iters=iters, strength=strength, max_move=max_move, outliers=outliers,
-        unshrink=unshrink, neighbours=neighbours, radius=radius, sigma_d=sigma_d, sigma_n=sigma_n, seed=seed, threads=threads,
+        unshrink=unshrink, neighbours=neighbours, radius=radius, sigma_d=sigma_d, sigma_n=sigma_n, uncertainty=uncertainty,
+        seed=seed, threads=threads,
     )  # fmt: skip
     console, sources = Console(quiet, verbose), expand(inputs)
     if shard:
@@ -247,6 +251,8 @@ class _Cleaning:
         cleaned = scan.moved_to(rows.points)
         if self.displacement:
             cleaned = with_displacement(scan.points, cleaned)
+        if rows.std is not None:
+            cleaned = with_uncertainty(cleaned, rows.std)
         return cleaned.with_attributes(outlier=rows.outlier.astype("u1")) if self.config.outliers == "flag" else cleaned
 
     def _clean_whole(self, job: Job) -> Figures:
@@ -288,6 +294,8 @@ class _Cleaning:
         cleaned = scan.moved_to(result.points)
         if self.displacement:
             cleaned = with_displacement(scan.points, cleaned)
+        if result.std is not None:
+            cleaned = with_uncertainty(cleaned, result.std)
         if self.config.outliers == "flag":
             cleaned = cleaned.with_attributes(outlier=result.outlier.astype("u1"))
         return io.select(cleaned, ~result.outlier) if self.config.outliers == "remove" else cleaned
