@@ -16,7 +16,7 @@ from pcdenoise.commands.console import Console, figure, table
 from pcdenoise.commands.files import STREAM, Job, expand, format_of, plan, refuse_existing
 from pcdenoise.commands.memory import n_bytes
 from pcdenoise.commands.options import configured, option
-from pcdenoise.commands.undo import with_displacement, with_uncertainty
+from pcdenoise.commands.undo import with_colours, with_displacement, with_uncertainty
 from pcdenoise.commands.verify import MaxDrift, check_drift
 from pcdenoise.errors import UsageError
 
@@ -70,6 +70,9 @@ def denoise(
     roi: selection.Roi = "",
     displacement: Annotated[
         bool, option("--displacement", help="Store where each point was and how far it moved; undo needs it.")
+    ] = False,
+    colour: Annotated[
+        bool, option("--colour", help="Smooth red, green and blue as well, along the cleaned surface; edges stay.")
     ] = False,
     uncertainty: Annotated[
         bool, option("--uncertainty", help="Store how far each point may still be off: a standard deviation, in the file's unit.")
@@ -143,7 +146,7 @@ def denoise(
     chosen = selection.Selection.of(only_class, context, roi)
     cleaning = _Cleaning(
         settings, chosen, chosen_model(model, settings), console, format, overwrite, drop_attributes, displacement, max_drift,
-        pictures, n_bytes(max_memory) // workers, tile, resume,
+        pictures, n_bytes(max_memory) // workers, tile, resume, colour,
     )  # fmt: skip
     batch = Batch(console)
     batch.run(jobs, cleaning.clean, run)
@@ -181,13 +184,15 @@ class _Cleaning:
     max_bytes: int
     tile: int | None = None
     resume: bool = False
+    colour: bool = False
     pages: list[Page] = field(default_factory=list)
 
     @property
     def settings(self) -> dict[str, Any]:
         """Everything that shaped the result, by name, for the report and the file's provenance."""
         named = {"model": self.model.name, "model_sha256": self.model.sha256} if self.model else {}
-        return {**self.config.model_dump(mode="json"), **self.selection.settings, **named}
+        colour = {"colour": True} if self.colour else {}
+        return {**self.config.model_dump(mode="json"), **self.selection.settings, **named, **colour}
 
     def clean(self, job: Job) -> Figures:
         """Reads one scan, cleans it, writes it with its picture, and returns its figures; in cells on disk if it is too large."""
@@ -211,6 +216,7 @@ class _Cleaning:
         global_ = needs_the_whole(self.model, self.config)
         for is_asked, fault in (
             (self.config.outliers == "remove", "--outliers remove: use --outliers flag"),
+            (self.colour, "--colour: leave it out"),
             (self.selection != selection.Selection(), "--only-class and --roi: leave them out"),
             (global_, f"{global_}: leave it out"),
             (job.source in self.pictures, "--picture: leave it out"),
@@ -292,6 +298,8 @@ class _Cleaning:
         from pcdenoise import io
 
         cleaned = scan.moved_to(result.points)
+        if self.colour:
+            cleaned = with_colours(scan, cleaned, undoable=self.displacement, threads=self.config.threads)
         if self.displacement:
             cleaned = with_displacement(scan.points, cleaned)
         if result.std is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 ORIGINAL = ("original_x", "original_y", "original_z")
 DISPLACEMENT = "displacement"
 """Columns that `denoise --displacement` adds: the place before, and the distance from it, in the file's unit."""
+COLOUR = ("red", "green", "blue")
+ORIGINAL_COLOUR = ("original_red", "original_green", "original_blue")
+"""Columns that `--displacement` adds beside these if `--colour` changed the colours."""
 UNCERTAINTY = "uncertainty"
 """The column that `denoise --uncertainty` adds: standard deviation of what the point may still be off, in the file's unit."""
 
@@ -55,6 +59,25 @@ def with_displacement(before: Points, after: Scan) -> Scan:
     return after.with_attributes(**columns, **{DISPLACEMENT: length.astype(np.float32)})
 
 
+def with_colours(before: Scan, after: Scan, *, undoable: bool, threads: int | None = None) -> Scan:
+    """The moved scan with its colours smoothed where points moved; undoable: the old ones stay in three more columns.
+
+    Raises ScanError without colours.
+    """
+    import numpy as np
+
+    from pcdenoise.denoising.colour import smoothed
+
+    if not set(COLOUR) <= set(after.attributes):
+        raise ScanError(f"{after.origin}: has no {', '.join(COLOUR)}; leave out --colour")
+    old = np.stack([after.attributes[name] for name in COLOUR], axis=1)
+    moved = (before.points != after.points).any(axis=1)
+    new = np.where(moved[:, None], smoothed(after.points, old, threads or -1), old)
+    coloured = replace(after, attributes={**after.attributes, **{name: new[:, i].copy() for i, name in enumerate(COLOUR)}})
+    kept = {name: old[:, i].copy() for i, name in enumerate(ORIGINAL_COLOUR)} if undoable else {}
+    return coloured.with_attributes(**kept)
+
+
 def with_uncertainty(after: Scan, std: NDArray[np.float64]) -> Scan:
     """The moved scan with one more column. Raises ScanError if it has one of that name already, which would be lost."""
     if UNCERTAINTY in after.attributes:
@@ -75,8 +98,11 @@ def restored(scan: Scan) -> Scan:
     names = [*ORIGINAL, DISPLACEMENT]
     if set(names) <= set(scan.attributes) or (names := _last_columns(scan)):
         before = np.stack([scan.attributes[name].astype(np.float64) for name in names[:3]], axis=1)
-        added = [name for name in (*names, UNCERTAINTY) if name in scan.attributes]
-        return io.without(scan, added).moved_to(before)
+        if set(ORIGINAL_COLOUR) <= set(scan.attributes):
+            colours = {name: scan.attributes[original] for name, original in zip(COLOUR, ORIGINAL_COLOUR, strict=True)}
+            scan = replace(scan, attributes={**scan.attributes, **colours})
+        added = [name for name in (*names, *ORIGINAL_COLOUR, UNCERTAINTY) if name in scan.attributes]
+        return io.without(scan, list(dict.fromkeys(added))).moved_to(before)
     raise ScanError(f"{scan.origin}: no places before the move are stored; only what denoise --displacement wrote can be undone")
 
 
