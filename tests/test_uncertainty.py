@@ -14,20 +14,17 @@ from pcdenoise.networks import store
 ASKED = DenoiseConfig(threads=1, uncertainty=True)
 
 
-def test_two_thirds_of_the_distances_are_within_one_standard_deviation_and_most_within_two() -> None:
-    """The normal law says 0.683 and 0.954. Clouds differ from each other by 0.09 and 0.03 (standard deviation over those of
-    benchmarks/uncertainty), so that a mean over six is within twice that over the square root of six."""
-    within: dict[int, list[float]] = {1: [], 2: []}
-    for name in ("plane", "torus", "cube"):
-        for std_spacings in (0.5, 1.5):
-            noisy = cloud(name, 4000, std_spacings, seed=3)
-            result = denoise(noisy.noisy, store.load(), ASKED)
-            assert result.std is not None
-            distance = np.abs(noisy.surface.signed_distance(result.points))
-            for k, shares in within.items():
-                shares.append(float((distance < k * result.std).mean()))
-    assert np.mean(within[1]) == pytest.approx(0.683, abs=2 * 0.09 / 6**0.5)
-    assert np.mean(within[2]) == pytest.approx(0.954, abs=2 * 0.03 / 6**0.5)
+@pytest.mark.parametrize("name", ["plane", "torus", "cube"])
+@pytest.mark.parametrize("std_spacings", [0.5, 1.5])
+def test_two_thirds_of_the_distances_are_within_one_standard_deviation_most_within_two(name: str, std_spacings: float) -> None:
+    """The normal law says 0.683 and 0.954. Clouds of benchmarks/uncertainty miss that by 0.053 and 0.040 (root mean square over
+    36); three times that is allowed."""
+    noisy = cloud(name, 4000, std_spacings, seed=3)
+    result = denoise(noisy.noisy, store.load(), ASKED)
+    assert result.std is not None
+    distance = np.abs(noisy.surface.signed_distance(result.points))
+    assert (distance < result.std).mean() == pytest.approx(0.683, abs=3 * 0.053)
+    assert (distance < 2 * result.std).mean() == pytest.approx(0.954, abs=3 * 0.040)
 
 
 def test_a_cloud_in_another_unit_and_place_is_uncertain_in_that_unit() -> None:

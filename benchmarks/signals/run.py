@@ -69,6 +69,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--shapes", type=int, default=16, help="to learn from")
+    parser.add_argument("--cloud-points", type=int, default=20_000, help="of a cloud to learn from")
     parser.add_argument("--judged", type=int, default=8, help="shapes to judge on")
     parser.add_argument("--points", type=int, default=10_000, help="of a judged cloud")
     parser.add_argument("--signals", nargs="*", choices=SIGNALS, default=SIGNALS)
@@ -79,7 +80,16 @@ def main() -> None:
         work = options.work or Path(temporary)
         data = str(work / "data")
         if not (work / "data" / "dataset.json").exists():
-            made = ["synth", f"shapes:{options.shapes}", "-o", data, "--points", "20000", "--levels", "0.4,0.8,1.2"]
+            made = [
+                "synth",
+                f"shapes:{options.shapes}",
+                "-o",
+                data,
+                "--points",
+                str(options.cloud_points),
+                "--levels",
+                "0.4,0.8,1.2",
+            ]
             commands.main([*made, "--seed", str(TRAINING_SEED), "--quiet"])
         shapes = judged_shapes(options.judged, options.points)
         untrained = work / "untrained"
