@@ -242,18 +242,29 @@ def test_a_signal_ends_the_command_with_its_code_and_leaves_nothing(number: sign
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("added", [[], ["--uncertainty"]])
 @pytest.mark.parametrize("format", ["xyz", "ply", "pcd", "las", "laz"])
-def test_undo_gives_back_the_very_coordinates_and_attributes(format: str, sphere: Path) -> None:
+def test_undo_gives_back_the_very_coordinates_and_attributes(format: str, added: list[str], sphere: Path) -> None:
     original, clean, back = (sphere.with_name(f"{name}.{format}") for name in ("original", "clean", "back"))
     pcdenoise.write(pcdenoise.read(sphere), original)
-    assert main(["denoise", str(original), "-o", str(clean), "--displacement", "-q", *FAST]) == 0
+    assert main(["denoise", str(original), "-o", str(clean), "--displacement", *added, "-q", *FAST]) == 0
     before, moved = pcdenoise.read(original), pcdenoise.read(clean)
+    assert len(moved.attributes) == len(before.attributes) + 4 + len(added)
     assert not np.array_equal(moved.points, before.points)
     assert main(["undo", str(clean), "-o", str(back)]) == 0
     after = pcdenoise.read(back)
     assert np.array_equal(after.points, before.points)
     for name, values in before.attributes.items():
         assert np.array_equal(after.attributes[name], values)
+    assert set(after.attributes) == set(before.attributes)
+
+
+def test_a_column_named_uncertainty_is_not_written_over(sphere: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, second = sphere.with_name("first.ply"), sphere.with_name("second.ply")
+    assert main(["denoise", str(sphere), "-o", str(first), "--uncertainty", "-q", *FAST]) == 0
+    assert main(["denoise", str(first), "-o", str(second), "--uncertainty", "-q", *FAST]) == 3
+    assert "leave out --uncertainty" in the_one_line(capsys.readouterr().err)
+    assert not second.exists()
 
 
 def test_undo_is_exact_for_float32_coordinates_that_cross_zero(tmp_path: Path, rng: np.random.Generator) -> None:

@@ -32,7 +32,9 @@ def cleaned_in_cells(points: np.ndarray, folder: Path, config: DenoiseConfig, ce
     kind = model("seeded") if config.method == "network" else None
     job = Tiles(folder, chunks, kind, config, cell_points, {})
     job.run()
-    return np.concatenate([np.empty((0, 3)), *(rows.points for rows in job.rows())]), job
+    found = list(job.rows())
+    job.figures["std"] = [rows.std for rows in found if rows.std is not None]
+    return np.concatenate([np.empty((0, 3)), *(rows.points for rows in found)]), job
 
 
 CASES = {
@@ -42,6 +44,7 @@ CASES = {
     "passes after passes": (1.0, {"iters": 3, "relax_steps": 0}, 3),
     "until it stops by itself": (0.5, {"iters": "auto"}, 4),
     "half the way": (0.5, {"strength": 0.5, "max_move": 0.02, "outliers": "flag"}, 5),
+    "with uncertainty": (0.5, {"uncertainty": True, "max_move": 0.05}, 7),
     "jets": (0.5, {"method": "jet"}, 6),
     "bilateral": (0.5, {"method": "bilateral"}, 6),
 }
@@ -62,6 +65,9 @@ def test_cells_give_what_the_whole_gives(name: str, tmp_path: Path) -> None:
     for figure in ("iterations", "points_not_finite", "points_coincident", "outliers", "points_left_alone", "is_surface"):
         assert job.figures[figure] == whole.figures[figure]
     assert job.figures["noise"] == pytest.approx(whole.figures["noise"], rel=1e-9)
+    assert bool(job.figures["std"]) == config.uncertainty
+    if whole.std is not None:
+        np.testing.assert_allclose(np.concatenate(job.figures["std"]), whole.std, atol=2e-3 * whole.figures["noise"])
 
 
 def test_a_rim_is_needed_for_that(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,6 +30,7 @@ class DenoiseConfig(Settings):
     max_move: float | None = Field(None, gt=0, description="Longest move of any point, in the scan's unit.")
     relax_steps: int = Field(4, ge=0, le=100, description="Steps toward even spacing, within the noise; 0 for none.")
     outliers: Literal["keep", "flag", "remove"] = Field("keep", description="What becomes of isolated points.")
+    uncertainty: bool = Field(False, description="Say for every point how far it may still be off, as a standard deviation.")
     unshrink: bool | None = Field(
         None, description="Take low-frequency moves back, which shrink a cloud pass by pass; by default with mcconv models."
     )

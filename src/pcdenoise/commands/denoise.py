@@ -17,7 +17,7 @@ from pcdenoise.commands.console import Console, figure, table
 from pcdenoise.commands.files import STREAM, Job, expand, format_of, plan, refuse_existing
 from pcdenoise.commands.memory import n_bytes
 from pcdenoise.commands.options import configured, option
-from pcdenoise.commands.undo import with_displacement
+from pcdenoise.commands.undo import with_colours, with_displacement, with_uncertainty
 from pcdenoise.commands.verify import MaxDrift, check_drift
 from pcdenoise.errors import UsageError
 
@@ -72,6 +72,12 @@ def denoise(
     displacement: Annotated[
         bool, option("--displacement", help="Store where each point was and how far it moved; undo needs it.")
     ] = False,
+    colour: Annotated[
+        bool, option("--colour", help="Smooth red, green and blue as well, along the cleaned surface; edges stay.")
+    ] = False,
+    uncertainty: Annotated[
+        bool, option("--uncertainty", help="Store how far each point may still be off: a standard deviation, in the file's unit.")
+    ] = False,
     max_memory: Annotated[
         str | None,
         option("--max-memory", metavar="SIZE", help="Never hold more than this: 800M, 2G; half of what is free if not given."),
@@ -118,7 +124,8 @@ def denoise(
 
     settings = configured(
         DenoiseConfig, method=method, iters=iters, strength=strength, max_move=max_move, outliers=outliers,
-        unshrink=unshrink, neighbours=neighbours, radius=radius, sigma_d=sigma_d, sigma_n=sigma_n, seed=seed, threads=threads,
+        unshrink=unshrink, neighbours=neighbours, radius=radius, sigma_d=sigma_d, sigma_n=sigma_n, uncertainty=uncertainty,
+        seed=seed, threads=threads,
     )  # fmt: skip
     console, sources = Console(quiet, verbose), expand(inputs)
     share = files.shard(sources, shard) if shard else sources
@@ -147,7 +154,7 @@ def denoise(
     chosen = selection.Selection.of(only_class, context, roi)
     cleaning = _Cleaning(
         settings, chosen, chosen_model(model, settings), console, format, overwrite or is_far, drop_attributes, displacement,
-        max_drift, pictures, n_bytes(max_memory) // workers, tile,
+        max_drift, pictures, n_bytes(max_memory) // workers, tile, colour,
     )  # fmt: skip
     batch = Batch(console)
     batch.run(jobs, cleaning.clean, run)
@@ -192,13 +199,15 @@ class _Cleaning:
     pictures: dict[Path, Path]
     max_bytes: int
     tile: int | None = None
+    colour: bool = False
     pages: list[Page] = field(default_factory=list)
 
     @property
     def settings(self) -> dict[str, Any]:
         """Everything that shaped the result, by name, for the report and the file's provenance."""
         named = {"model": self.model.name, "model_sha256": self.model.sha256} if self.model else {}
-        return {**self.config.model_dump(mode="json"), **self.selection.settings, **named}
+        colour = {"colour": True} if self.colour else {}
+        return {**self.config.model_dump(mode="json"), **self.selection.settings, **named, **colour}
 
     def clean(self, job: Job) -> Figures:
         """Reads one scan, cleans it, writes it with its picture, and returns its figures; in cells on disk if it is too large."""
@@ -222,6 +231,7 @@ class _Cleaning:
         global_ = needs_the_whole(self.model, self.config)
         for is_asked, fault in (
             (self.config.outliers == "remove", "--outliers remove: use --outliers flag"),
+            (self.colour, "--colour: leave it out"),
             (self.selection != selection.Selection(), "--only-class and --roi: leave them out"),
             (global_, f"{global_}: leave it out"),
             (job.source in self.pictures, "--picture: leave it out"),
@@ -260,6 +270,8 @@ class _Cleaning:
         cleaned = scan.moved_to(rows.points)
         if self.displacement:
             cleaned = with_displacement(scan.points, cleaned)
+        if rows.std is not None:
+            cleaned = with_uncertainty(cleaned, rows.std)
         return cleaned.with_attributes(outlier=rows.outlier.astype("u1")) if self.config.outliers == "flag" else cleaned
 
     def _clean_whole(self, job: Job) -> Figures:
@@ -299,8 +311,12 @@ class _Cleaning:
         from pcdenoise import io
 
         cleaned = scan.moved_to(result.points)
+        if self.colour:
+            cleaned = with_colours(scan, cleaned, undoable=self.displacement, threads=self.config.threads)
         if self.displacement:
             cleaned = with_displacement(scan.points, cleaned)
+        if result.std is not None:
+            cleaned = with_uncertainty(cleaned, result.std)
         if self.config.outliers == "flag":
             cleaned = cleaned.with_attributes(outlier=result.outlier.astype("u1"))
         return io.select(cleaned, ~result.outlier) if self.config.outliers == "remove" else cleaned

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,11 +13,19 @@ from pcdenoise.commands.files import format_of, refuse_existing
 from pcdenoise.errors import ScanError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from pcdenoise.cloud.scan import Points, Scan
 
 ORIGINAL = ("original_x", "original_y", "original_z")
 DISPLACEMENT = "displacement"
 """Columns that `denoise --displacement` adds: the place before, and the distance from it, in the file's unit."""
+COLOUR = ("red", "green", "blue")
+ORIGINAL_COLOUR = ("original_red", "original_green", "original_blue")
+"""Columns that `--displacement` adds beside these if `--colour` changed the colours."""
+UNCERTAINTY = "uncertainty"
+"""The column that `denoise --uncertainty` adds: standard deviation of what the point may still be off, in the file's unit."""
 
 
 def undo(
@@ -50,10 +59,37 @@ def with_displacement(before: Points, after: Scan) -> Scan:
     return after.with_attributes(**columns, **{DISPLACEMENT: length.astype(np.float32)})
 
 
-def restored(scan: Scan) -> Scan:
-    """The scan before it was moved, without the four columns. Raises ScanError if they are not there.
+def with_colours(before: Scan, after: Scan, *, undoable: bool, threads: int | None = None) -> Scan:
+    """The moved scan with its colours smoothed where points moved; undoable: the old ones stay in three more columns.
 
-    A text without a header does not keep names: there the last four columns are taken, if they agree with the coordinates.
+    Raises ScanError without colours.
+    """
+    import numpy as np
+
+    from pcdenoise.denoising.colour import smoothed
+
+    if not set(COLOUR) <= set(after.attributes):
+        raise ScanError(f"{after.origin}: has no {', '.join(COLOUR)}; leave out --colour")
+    old = np.stack([after.attributes[name] for name in COLOUR], axis=1)
+    moved = (before.points != after.points).any(axis=1)
+    new = np.where(moved[:, None], smoothed(after.points, old, threads or -1), old)
+    coloured = replace(after, attributes={**after.attributes, **{name: new[:, i].copy() for i, name in enumerate(COLOUR)}})
+    kept = {name: old[:, i].copy() for i, name in enumerate(ORIGINAL_COLOUR)} if undoable else {}
+    return coloured.with_attributes(**kept)
+
+
+def with_uncertainty(after: Scan, std: NDArray[np.float64]) -> Scan:
+    """The moved scan with one more column. Raises ScanError if it has one of that name already, which would be lost."""
+    if UNCERTAINTY in after.attributes:
+        raise ScanError(f"{after.origin}: has a column {UNCERTAINTY} already; rename it, or leave out --uncertainty")
+    return after.with_attributes(**{UNCERTAINTY: std.astype("f4")})
+
+
+def restored(scan: Scan) -> Scan:
+    """The scan before it was moved, without the columns that cleaning added. Raises ScanError if its places are not there.
+
+    A text without a header does not keep names: there the last four columns are taken, or the four before the last (the
+    uncertainty), if they agree with the coordinates.
     """
     import numpy as np
 
@@ -62,18 +98,28 @@ def restored(scan: Scan) -> Scan:
     names = [*ORIGINAL, DISPLACEMENT]
     if set(names) <= set(scan.attributes) or (names := _last_columns(scan)):
         before = np.stack([scan.attributes[name].astype(np.float64) for name in names[:3]], axis=1)
-        return io.without(scan, names).moved_to(before)
+        if set(ORIGINAL_COLOUR) <= set(scan.attributes):
+            colours = {name: scan.attributes[original] for name, original in zip(COLOUR, ORIGINAL_COLOUR, strict=True)}
+            scan = replace(scan, attributes={**scan.attributes, **colours})
+        added = [name for name in (*names, *ORIGINAL_COLOUR, UNCERTAINTY) if name in scan.attributes]
+        return io.without(scan, list(dict.fromkeys(added))).moved_to(before)
     raise ScanError(f"{scan.origin}: no places before the move are stored; only what denoise --displacement wrote can be undone")
 
 
 def _last_columns(scan: Scan) -> list[str]:
-    """The names of the last four columns of a text, if the last is the distance between the coordinates and the other three."""
+    """The names of the last columns of a text, if the fourth is the distance between the coordinates and the first three."""
+    names = list(scan.attributes)
+    if scan.format != "xyz":
+        return []
+    return next((last for last in (names[-4:], names[-5:]) if _is_displacement(scan, last[:4])), [])
+
+
+def _is_displacement(scan: Scan, names: list[str]) -> bool:
     import numpy as np
 
-    names = list(scan.attributes)[-4:]
-    if scan.format != "xyz" or len(names) < 4:
-        return []
+    if len(names) < 4:
+        return False
     *before, displacement = (np.asarray(scan.attributes[name], dtype=np.float64) for name in names)
     length = np.linalg.norm(scan.points - np.stack(before, axis=1), axis=1)
     tolerance = 1e-3 * np.nanmax(displacement, initial=0.0)
-    return names if np.allclose(length[scan.finite], displacement[scan.finite], rtol=1e-3, atol=tolerance) else []
+    return bool(np.allclose(length[scan.finite], displacement[scan.finite], rtol=1e-3, atol=tolerance))

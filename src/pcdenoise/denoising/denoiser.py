@@ -20,7 +20,7 @@ from pcdenoise.cloud.neighbours import coordinate_hash, distinct_by, drawn_by, s
 from pcdenoise.cloud.noise_level import NoiseLevel, estimate, estimate_at, probes
 from pcdenoise.cloud.scan import Mask, Points, check_extent, within
 from pcdenoise.config import DenoiseConfig
-from pcdenoise.denoising import classical, outliers
+from pcdenoise.denoising import classical, outliers, uncertainty
 from pcdenoise.denoising.held_out import HeldOut
 from pcdenoise.errors import ModelError, UsageError
 from pcdenoise.networks.store import Model
@@ -64,13 +64,18 @@ class Step:
 
 @dataclass(frozen=True)
 class Result:
-    """A cleaned cloud: points (N, 3), outlier (N,), left_alone (N,) rows that were not moved, figures for the report, steps."""
+    """A cleaned cloud: points (N, 3), outlier (N,), left_alone (N,) rows that were not moved, figures for the report, steps.
+
+    std (N,), if the configuration asks for it: standard deviation of what each point is still off along the normal, in the
+    points' unit; NaN for rows that are not finite and where there is no surface.
+    """
 
     points: Points
     outlier: Mask
     left_alone: Mask
     figures: dict[str, Any]
     steps: list[Step] = field(default_factory=list)
+    std: NDArray[np.float64] | None = None
 
 
 def denoise(
@@ -110,8 +115,13 @@ def denoise(
         "points_coincident": int(cloud.finite.sum()) - len(cloud.start),
         "outliers": int(found.sum()),
     }
+    std = None
+    if config.uncertainty:
+        order = spatial_order(cloud.reached)
+        off = uncertainty.estimate(cloud.reached[order], cloud.start, cloud.reached, moved, cloud.level, cloud.threads)
+        std = cloud.to_rows(off, np.nan)
     placed = [Step(cloud.placed(step.points), step.figures) for step in steps]
-    return Result(placed[-1].points if placed else points.copy(), found, unmoved, figures, placed)
+    return Result(placed[-1].points if placed else points.copy(), found, unmoved, figures, placed, std)
 
 
 def iterate(points: Points, model: Model | None, config: DenoiseConfig) -> Iterator[Step]:
@@ -122,7 +132,10 @@ def iterate(points: Points, model: Model | None, config: DenoiseConfig) -> Itera
 
 
 class _Cloud:
-    """The distinct finite points of an input in spatial order around their own origin, and the way back to its rows."""
+    """The distinct finite points of an input in spatial order around their own origin, and the way back to its rows.
+
+    reached (D, 3): where the passes so far led them, before strength and limit.
+    """
 
     def __init__(self, points: Points, config: DenoiseConfig, level: NoiseLevel | None = None) -> None:
         self.config, self.rows = config, points
@@ -137,6 +150,7 @@ class _Cloud:
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
         self.start: Points = usable[first][order] - self.origin
+        self.reached = self.start
         self.identity: Identity = identity[first][order]
         self._row = back[place]
         self.probes = probes(drawn_by(self.identity, config.seed))
@@ -236,6 +250,7 @@ def _passes(
             **judgement,
         }
         points, level = moved, after
+        cloud.reached = moved
         yield Step(limited(cloud.start, points, config), figures)
 
 

@@ -49,6 +49,10 @@ def denoise_part(
     moved[rows[chosen]] = result.points[chosen]
     outlier[rows[chosen]] = result.outlier[chosen]
     left_alone[rows[chosen]] = result.left_alone[chosen]
+    std = None
+    if result.std is not None:
+        std = np.full(len(points), np.nan)
+        std[rows[chosen]] = result.std[chosen]
     length = np.linalg.norm((moved - points)[rows[chosen]], axis=1)
     figures = {
         **result.figures,
@@ -61,4 +65,4 @@ def denoise_part(
         "points_selected": int(movable.sum()),
         "points_seen": len(rows),
     }
-    return replace(result, points=moved, outlier=outlier, left_alone=left_alone, figures=figures)
+    return replace(result, points=moved, outlier=outlier, left_alone=left_alone, figures=figures, std=std)

@@ -10,10 +10,11 @@ FOLDER/plan.json        what is cleaned and how, and the cuts between the cells
 FOLDER/start/7.f64      distinct points of cell 7: x, y, z in the local frame and the hash of the place in the file, ascending
 FOLDER/start/7.i8       for each of its rows, in file order, which of these it is
 FOLDER/pass_2/7.f64     where they are after the second pass
-FOLDER/done/7.f64       its rows at their new places, and 1 for an outlier plus 2 for who stayed
+FOLDER/done/7.f64       its rows at their new places, 1 for an outlier plus 2 for who stayed, and the uncertainty if asked for
 FOLDER/pass_2.json      the noise level after the second pass
 FOLDER/drift/7.json     how far its surface moved, see cloud.drift
 FOLDER/outliers/7.u1    whether each distinct point is an outlier
+FOLDER/std/7.f64        how far each distinct point may still be off
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from pcdenoise.cloud.neighbours import Distances, NeighbourSearch, coordinate_ha
 from pcdenoise.cloud.noise_level import N_PROBES, NoiseLevel, estimate_from
 from pcdenoise.cloud.scan import Mask, Points, check_extent
 from pcdenoise.config import DenoiseConfig
-from pcdenoise.denoising import classical, denoiser, held_out, outliers
+from pcdenoise.denoising import classical, denoiser, held_out, outliers, uncertainty
 from pcdenoise.denoising.denoiser import Identity, Progress
 from pcdenoise.networks.store import Model
 
@@ -72,11 +73,12 @@ def points_per_cell(max_bytes: int) -> int:
 
 @dataclass(frozen=True)
 class Rows:
-    """Points of one chunk after cleaning: points (n, 3), outlier (n,), unmoved (n,)."""
+    """Points of one chunk after cleaning: points (n, 3), outlier (n,), unmoved (n,), std (n,) as of `denoiser.Result`, if any."""
 
     points: Points
     outlier: Mask
     unmoved: Mask
+    std: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -197,6 +199,9 @@ class Tiles:
             if number > 2:
                 shutil.rmtree(self.folder / f"pass_{number - 2}", ignore_errors=True)
             level, n_done = after, number
+        if self.config.uncertainty:
+            for cell in self.cells:
+                self.find_uncertainty(cell, n_done, first)
         drifts = [self._drift(cell, n_done) for cell in self.cells]
         share = np.array([n for n, _, _ in drifts]) / max(1, self.plan["n_distinct"])
         self.figures = {
@@ -216,6 +221,7 @@ class Tiles:
         origin, n_done = np.array(self.plan["origin"]), self.figures["iterations"]
         read = np.zeros(len(self.cells), dtype=np.int64)
         lengths: list[NDArray[np.float64]] = []
+        width = 4 + self.config.uncertainty
         step = -(-self.plan["n_rows"] // _N_LENGTHS) or 1
         n_unmoved = n_outliers = 0
         longest = 0.0
@@ -223,14 +229,17 @@ class Tiles:
             self._finish(cell, n_done)
         for chunk in self.chunks():
             finite = np.flatnonzero(np.isfinite(chunk).all(axis=1))
-            result = Rows(chunk.copy(), np.zeros(len(chunk), bool), np.ones(len(chunk), bool))
+            std = np.full(len(chunk), np.nan) if self.config.uncertainty else None
+            result = Rows(chunk.copy(), np.zeros(len(chunk), bool), np.ones(len(chunk), bool), std)
             for cell, those in _by_cell(_cell_of(chunk[finite] - origin, self.plan["cuts"])):
                 path = self.folder / "done" / f"{cell}.f64"
-                done = np.fromfile(path, count=4 * len(those), offset=32 * read[cell]).reshape(-1, 4)
+                done = np.fromfile(path, count=width * len(those), offset=8 * width * read[cell]).reshape(-1, width)
                 read[cell] += len(those)
                 rows, unmoved = finite[those], done[:, 3] >= 2
                 result.outlier[rows], result.unmoved[rows] = done[:, 3] % 2 == 1, unmoved
                 result.points[rows[~unmoved]] = done[~unmoved, :3] + origin
+                if std is not None:
+                    std[rows] = done[:, 4]
             length = np.linalg.norm(result.points[finite] - chunk[finite], axis=1)
             lengths.append(length[::step])
             longest = max(longest, float(length.max(initial=0.0)))
@@ -353,6 +362,17 @@ class Tiles:
             found[order] = outliers.find(tile.points[order], level=level, threads=self.threads)
             _write(path, found[: len(own.points)].tobytes())
 
+    def find_uncertainty(self, cell: int, number: int, level: NoiseLevel) -> None:
+        """How far the points of one cell may still be off after that pass; nothing if that is done already."""
+        path = self.folder / "std" / f"{cell}.f64"
+        if not path.is_file():
+            own, tile = self._tile(cell, number)
+            start = self._part(cell, 0).points
+            final = start if number == 0 else denoiser.limited(start, own.points, self.config)
+            order = spatial_order(tile.points)
+            std = uncertainty.estimate(tile.points[order], start, own.points, final, level, self.threads)
+            _write(path, std.tobytes())
+
     def _tile(self, cell: int, number: int) -> tuple[_Part, _Part]:
         """A cell's own points after a pass, and these followed by its rim."""
         own = self._part(cell, number)
@@ -437,10 +457,12 @@ class Tiles:
             return
         start = self._part(cell, 0).points
         moved = start if number == 0 else denoiser.limited(start, self._part(cell, number).points, self.config)
-        done = np.zeros((len(start), 4))
+        done = np.zeros((len(start), 4 + self.config.uncertainty))
         done[:, :3], done[:, 3] = moved, 2 * (moved == start).all(axis=1)
         if self.config.outliers != "keep":
             done[:, 3] += np.fromfile(self.folder / "outliers" / f"{cell}.u1", bool)
+        if self.config.uncertainty:
+            done[:, 4] = np.fromfile(self.folder / "std" / f"{cell}.f64")
         _write(path, done[np.fromfile(self.folder / "start" / f"{cell}.i8", np.int64)].tobytes())
 
     def remove(self) -> None:

@@ -1,0 +1,117 @@
+"""Does learning from one scan pay? The shipped model against itself adapted to a scan with structured noise.
+
+    python benchmarks/adaptation/run.py [--laws quantised beam-bias] [--meshes MESH...] [--budget-s 180] [--json FILE]
+
+Each law is put on procedural shapes, whose surface is known; each mesh is scanned by the simulated HDL-64E with a bias per
+beam. The model learns from the noisy file alone, as in `pcdenoise train --data scan.ply --budget 3m`, and held-out points of
+the scan decide whether it is kept. `adapted` is what came back, `learned` what would have without that judgement: truth only
+reports, as shares of the noise.
+Not here: the adaptation (pcdenoise.learning.trainer).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from pcdenoise import io
+from pcdenoise.cloud.scan import Scan
+from pcdenoise.config import DenoiseConfig, TrainConfig
+from pcdenoise.denoising.denoiser import denoise
+from pcdenoise.learning import trainer
+from pcdenoise.learning.dataset import Surface
+from pcdenoise.learning.supervised import NearestSurface
+from pcdenoise.networks import store
+from pcdenoise.synthesis.lidar import scan_mesh
+from pcdenoise.synthesis.meshes import MeshQueries, load_mesh
+from pcdenoise.synthesis.noise import NOISES
+from pcdenoise.synthesis.shapes import random_surface
+
+SEED, N_TRUTH, LEVEL, RAY_STD, BIAS_STD = 91, 300_000, 0.02, 0.01, 0.005
+
+
+@dataclass(frozen=True)
+class Case:
+    """One scan: noisy (N, 3) and a function from (M, 3) points to their true distances."""
+
+    name: str
+    noisy: np.ndarray
+    distance: Callable[[np.ndarray], np.ndarray]
+
+    def rms(self, points: np.ndarray) -> float:
+        """Root mean square distance to the surface, of that of the noisy points."""
+        return float(np.sqrt((self.distance(points) ** 2).mean() / (self.distance(self.noisy) ** 2).mean()))
+
+
+def cases(laws: list[str], n_shapes: int, n_points: int, meshes: list[Path]) -> Iterator[Case]:
+    """Every law on every shape, then every mesh before the scanner."""
+    for law in laws:
+        for number in range(n_shapes):
+            sample = random_surface(np.random.default_rng([SEED, number]), N_TRUTH)
+            truth = NearestSurface(Surface(sample.points, sample.normals, 2 * (6 / N_TRUTH) ** 0.5))
+            noisy = NOISES[law](sample.points[:n_points], LEVEL, np.random.default_rng([SEED, 1, number]))
+            yield Case(f"{law}, shape {number}", noisy, lambda points, t=truth: t.error(torch.from_numpy(points).float()).numpy())
+    for path in meshes:
+        mesh = load_mesh(path)
+        scan = scan_mesh(mesh, np.random.default_rng(SEED), ray_std=RAY_STD, bias_std=BIAS_STD)
+        queries = MeshQueries(mesh)
+        yield Case(f"lidar, {path.stem}", scan.points, lambda points, q=queries: q.closest(points).distance)
+
+
+def trial(case: Case, folder: Path, budget_s: float | None, steps: int | None) -> dict[str, Any]:
+    """Errors as shares of the noise: shipped, adapted (as judged without truth), learned (whatever the judgement)."""
+    scan, output = folder / "scan.ply", folder / "model"
+    io.write(Scan(case.noisy, format="ply"), scan)
+    config = DenoiseConfig(threads=1)
+    shipped = case.rms(denoise(case.noisy, store.load(), config).points)
+    judge = trainer._Run.judge
+
+    def remembering(run: trainer._Run, before: Any, clouds: Any) -> None:
+        store.save(run.average, folder / "learned", summary="", training={}, scores={}, card="")
+        judge(run, before, clouds)
+
+    trainer._Run.judge = remembering  # type: ignore[method-assign]
+    try:
+        summary = trainer.train(TrainConfig(data=(str(scan),), budget_s=budget_s, steps=steps, threads=1), output)
+    finally:
+        trainer._Run.judge = judge  # type: ignore[method-assign]
+    adapted, learned = (case.rms(denoise(case.noisy, store.load(place), config).points) for place in (output, folder / "learned"))
+    about = {"scan": case.name, "points": len(case.noisy), "steps": summary.steps, "seconds": round(summary.seconds, 1)}
+    return {**about, "shipped": shipped, "adapted": adapted, "learned": learned, "verdict": summary.verdict}
+
+
+def main() -> None:
+    """Prints a table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--laws", nargs="*", choices=sorted(NOISES), default=["quantised", "beam-bias"])
+    parser.add_argument("--meshes", type=Path, nargs="*", default=[], help="to be scanned by the lidar")
+    parser.add_argument("--shapes", type=int, default=2)
+    parser.add_argument("--points", type=int, default=20_000)
+    parser.add_argument("--budget-s", type=float)
+    parser.add_argument("--steps", type=int)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    if options.budget_s is None and options.steps is None:
+        options.budget_s = 180.0
+    rows = []
+    print("| scan | steps | shipped | adapted | learned | verdict |\n| --- | --- | --- | --- | --- | --- |")
+    for case in cases(options.laws, options.shapes, options.points, options.meshes):
+        with tempfile.TemporaryDirectory() as folder:
+            row = trial(case, Path(folder), options.budget_s, options.steps)
+        rows.append(row)
+        errors = " | ".join(f"{row[name]:.3f}" for name in ("shipped", "adapted", "learned"))
+        print(f"| {row['scan']} | {row['steps']} | {errors} | {row['verdict']} |", flush=True)
+    if options.json:
+        options.json.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
