@@ -192,6 +192,14 @@ def most_passes(n_points: int, level: NoiseLevel, config: DenoiseConfig) -> int:
     return _MOST_PASSES if config.iters == "auto" else config.iters
 
 
+def is_worthwhile(residual: float, least: float, spacing: float) -> bool:
+    """Whether a pass that left this residual over held-out points is one that `auto` makes: `least` is the best one before it.
+
+    All in the points' unit; `least` is infinite before the first pass.
+    """
+    return residual <= (1 - _WORTHWHILE) * least - _NOTHING * spacing
+
+
 class Judge:
     """Held-out points and what they say of pass after pass. Which passes are worth making is theirs to say under `auto`."""
 
@@ -199,7 +207,7 @@ class Judge:
         self, held_out: HeldOut, level: NoiseLevel, diagonal: float, model: Model | None, config: DenoiseConfig, threads: int
     ) -> None:
         self._held_out, self._least = held_out, np.inf
-        self._nothing = _NOTHING * level.spacing
+        self._spacing = level.spacing
         self._model, self._config, self._diagonal, self._threads = model, config, diagonal, threads
 
     def residual(self) -> float | None:
@@ -211,7 +219,7 @@ class Judge:
             return one_pass(points, identity, level, self._diagonal, self._model, self._config, self._threads)
 
         found = self._held_out.after(fresh_pass)
-        if self._config.iters == "auto" and found > (1 - _WORTHWHILE) * self._least - self._nothing:
+        if self._config.iters == "auto" and not is_worthwhile(found, self._least, self._spacing):
             return None
         self._least = found
         return found
