@@ -212,7 +212,7 @@ def test_a_flag_beats_the_environment_beats_the_file_beats_the_default(sphere: P
     [
         ("[denoise]\nstrenght = 0.5\n", "--strenght"),
         ("[denose]\nstrength = 0.5\n", "denose"),
-        ("colour = 1\n", "--colour"),
+        ("hue = 1\n", "--hue"),
         ("strength = \n", "TOML"),
         ("[denoise]\nstrength = 'half'\n", "strength"),
     ],

@@ -20,6 +20,7 @@ import io_samples
 from pcdenoise.commands import main
 from pcdenoise.errors import ScanError
 from pcdenoise.io import kitti, las, pcd, ply, xyz
+from pcdenoise.io.las_dimensions import Dimension
 
 ROOT = Path(__file__).resolve().parent.parent
 QUICK = settings(max_examples=80, deadline=None, database=None)
@@ -86,6 +87,14 @@ def test_files_that_once_gave_warnings_are_read_without_a_word(kind: str, raw: b
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert len(READERS[kind](raw, "found")) > 0
+
+
+def test_a_wild_scale_of_an_extra_dimension_gives_infinities_without_a_word() -> None:
+    records = np.array([(7,), (-7,), (0,)], dtype=[("depth", "<i4")])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        values = Dimension("depth", "depth", scale=1e308).get(records)
+    assert values.tolist() == [np.inf, -np.inf, 0.0]
 
 
 PLAIN_VALUES = st.one_of(st.booleans(), st.integers(), st.floats(), st.text(max_size=8))

@@ -20,6 +20,7 @@ import sys
 import tempfile
 import time
 import traceback
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -314,7 +315,9 @@ def fuzz(paths: list[Path], minutes: float, rng: random.Random, tally: Tally) ->
 
 
 def _round_trip(path: Path, back: Path) -> None:
-    scan = io.read(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scan = io.read(path)
     with np.errstate(all="ignore"):
         io.write(scan.moved_to(scan.points + 0.001), back, overwrite=True)
     again = io.read(back)

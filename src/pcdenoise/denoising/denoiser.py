@@ -124,6 +124,11 @@ def denoise(
     return Result(placed[-1].points if placed else points.copy(), found, unmoved, figures, placed, std)
 
 
+def level_of(points: Points, config: DenoiseConfig) -> NoiseLevel:
+    """The noise level by which `denoise` would clean (N, 3) points."""
+    return _Cloud(points, config).level
+
+
 def iterate(points: Points, model: Model | None, config: DenoiseConfig) -> Iterator[Step]:
     """Pass after pass, each fed with the last one's output: (N, 3) points and figures of every step."""
     cloud = _Cloud(points, config)

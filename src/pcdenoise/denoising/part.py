@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pcdenoise.cloud.noise_level import estimate
 from pcdenoise.cloud.scan import Mask, Points
 from pcdenoise.config import DenoiseConfig
-from pcdenoise.denoising.denoiser import Progress, Result, denoise
+from pcdenoise.denoising.denoiser import Progress, Result, denoise, level_of
 from pcdenoise.networks.store import Model
 
 _REACH_SPACINGS = 64.0
@@ -32,7 +31,7 @@ def denoise_part(
     """
     usable = np.logical_and.reduce(np.isfinite(points), axis=1)
     movable = movable & seen
-    level = estimate(points[seen & usable], config.seed, config.threads or -1)
+    level = level_of(points[seen], config)
     worked = seen & usable
     if (movable & usable).any():
         passes = 10 if config.iters == "auto" else config.iters

@@ -43,7 +43,10 @@ class Dimension:
         stored = self._stored(records)
         if self.mask:
             return (stored & self.mask) >> self._shift
-        return stored * self.scale + self.offset if self._scaled else stored
+        if not self._scaled:
+            return stored
+        with np.errstate(over="ignore", invalid="ignore"):  # a scale may be any number; the values say so
+            return stored * self.scale + self.offset
 
     def holds(self, records: NDArray[Any], values: Column) -> bool:
         """Whether the record can store (N,) values exactly, or a scaled dimension to the nearest step."""
