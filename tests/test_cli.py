@@ -232,6 +232,7 @@ def test_a_signal_ends_the_command_with_its_code_and_leaves_nothing(number: sign
         [sys.executable, "-m", "pcdenoise", "denoise", "-", "-o", "out.xyz", "--format", "xyz", "-v", *FAST],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(ROOT / "src")},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # jobs in a shell's background inherit it ignored
     )  # fmt: skip
     assert process.stderr is not None
     assert b"reading" in process.stderr.readline()  # from here on it waits for stdin
