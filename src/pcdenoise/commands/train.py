@@ -62,6 +62,9 @@ def train(
         _prior("--unit", metavar="LENGTH", help="What the network calls 1, in the scans' unit; their diagonal if not given."),
     ] = None,
     part_points: Annotated[int, _prior("--part-points", min=1000, help="Cut larger scans to parts of so many points.")] = 150_000,
+    laps: Annotated[
+        int, _prior("--laps", min=1, max=20, help="distill: how often what was learned so far becomes the teacher.")
+    ] = 2,
     steps: Annotated[int | None, option("--steps", min=1, help="Stop after so many steps.")] = None,
     budget: Annotated[str | None, option("--budget", metavar="TIME", help="Stop after so long: 90s, 20m, 1.5h.")] = None,
     init: Annotated[
@@ -86,7 +89,7 @@ def train(
 
     settings = configured(
         TrainConfig, data=data, method=method, network=network, pairs=pairs, neighbours=neighbours, learning_rate=learning_rate,
-        prior=prior, kernel=kernel, alpha=alpha, beta=beta, unit=unit, part_points=part_points,
+        prior=prior, kernel=kernel, alpha=alpha, beta=beta, unit=unit, part_points=part_points, laps=laps,
         steps=steps, budget_s=_seconds(budget), seed=seed, threads=threads,
     )  # fmt: skip
     refuse_existing([output / "config.json"], overwrite or resume)
