@@ -17,11 +17,22 @@ cost more in calls than the cache saves."""
 Work = Callable[[slice], tuple[Tensor, ...]]
 
 
+def each_block(work: Callable[[slice], None], n: int, threads: int, block_points: int = BLOCK_POINTS) -> None:
+    """Calls `work` with the rows of each block.
+
+    A block's work is done by one thread, since threads that wait for each other after every small operation cost more than
+    they do.
+    """
+    blocks = [slice(i, min(i + block_points, n)) for i in range(0, n, block_points)]
+    with ThreadPoolExecutor(threads if threads > 0 else os.cpu_count()) as pool:
+        for _ in pool.map(work, blocks):
+            pass
+
+
 def in_blocks(work: Work, n: int, threads: int, block_points: int = BLOCK_POINTS) -> tuple[Tensor, ...]:
     """What `work` gives for the rows of each block, (B, …) each, put together to (n, …); n >= 1.
 
-    A block's work is done by one thread, since threads that wait for each other after every small operation cost more than
-    they do. Without gradients every result goes to its place at once, so that nothing but the results outlives its block.
+    Without gradients every result goes to its place at once, so that nothing but the results outlives its block.
     """
     blocks = [slice(i, min(i + block_points, n)) for i in range(0, n, block_points)]
     if len(blocks) == 1:
@@ -38,12 +49,9 @@ def in_blocks(work: Work, n: int, threads: int, block_points: int = BLOCK_POINTS
 
     def one(block: slice) -> None:
         with torch.no_grad():
-            put(block, work(block))
+            put(block, first if block.start == 0 else work(block))
 
-    put(blocks[0], first)
-    with ThreadPoolExecutor(threads if threads > 0 else os.cpu_count()) as pool:
-        for _ in pool.map(one, blocks[1:]):
-            pass
+    each_block(one, n, threads, block_points)
     return whole
 
 

@@ -17,8 +17,9 @@ from torch import Tensor
 from pcdenoise.cloud.neighbours import Indices, NeighbourSearch, coordinate_hash, drawn_by
 from pcdenoise.cloud.noise_level import NoiseLevel
 from pcdenoise.cloud.scan import Points
-from pcdenoise.denoising.blocks import BLOCK_POINTS, in_blocks
+from pcdenoise.denoising.blocks import BLOCK_POINTS, each_block, in_blocks
 from pcdenoise.errors import ModelError
+from pcdenoise.networks import fused
 from pcdenoise.networks.projection import (
     Edges,
     Planes,
@@ -125,14 +126,14 @@ def descend(
     Points stay float64 and only differences between neighbours become float32. The result does not depend on `block_points`.
     Raises ModelError when a stage gives positions that are not numbers.
     """
-    k = network.config.neighbours
+    k, kind = network.config.neighbours, _Fused if fused.runs(network) else _Looking
     points = torch.from_numpy(seeds)
     weights = None if count is None else torch.from_numpy(count.astype(np.float32))
     features: Tensor | None = None
     stages: list[Tensor] = []
     surface = torch.ones(0)
     for stage in network.among:
-        looking = _Looking(points, points, weights, k, noise, block_points, threads)
+        looking = kind(points, points, weights, k, noise, block_points, threads)
         own, known = looking.around(stage)
         surface = surface if stages else trust(own, noise)
         features = known if features is None else features + known
@@ -141,9 +142,9 @@ def descend(
         stages.append(points)
     if raw is None or features is None:
         return Descent(stages, surface, None)
-    seed_planes = _Looking(points, points, weights, k, noise, block_points, threads).planes()
+    seed_planes = kind(points, points, weights, k, noise, block_points, threads).planes()
     landing = torch.from_numpy(raw)
-    move = _Looking(landing, points, weights, k, noise, block_points, threads).landing(
+    move = kind(landing, points, weights, k, noise, block_points, threads).landing(
         network.landing, seed_planes, features, on_block
     )
     return Descent(stages, surface, _numbers(landing + move.double()))
@@ -240,3 +241,61 @@ class _Looking:
         if self._only_features is None:
             self._only_features = edge_features(graph, mine, theirs, self.noise)
         return self._only_features
+
+
+class _Fused:
+    """What `_Looking` does, in compiled code: no edge is ever written to memory, so blocks are large."""
+
+    def __init__(
+        self, points: Tensor, sources: Tensor, count: Tensor | None, k: int, noise: float, block_points: int, threads: int
+    ) -> None:
+        index = torch.from_numpy(NeighbourSearch(sources.numpy(), threads).nearest(points.numpy(), k))
+        self.around_us = fused.Surroundings(points.contiguous(), sources.contiguous(), index, count, noise)
+        self.block_points, self.threads = block_points, threads
+
+    def planes(self) -> Planes:
+        """Tangent planes of all points."""
+        return self._seen(None)[0]
+
+    def around(self, stage: Stage) -> tuple[Planes, Tensor]:
+        """Tangent planes and first features (M, C) of all points."""
+        return self._seen(stage)
+
+    def messages(self, stage: Stage, planes: Planes, features: Tensor, on_block: Callable[[int], None]) -> tuple[Tensor, Tensor]:
+        """(M, 3) moves and (M, C) features after all rounds of a stage, one by one: points hear of each other's news."""
+        moves = torch.empty(len(features), 3)
+        for number, layer in enumerate(stage.exchanges):
+            last = number + 1 == len(stage.exchanges)
+            heard = layer.hear(features)[None]
+            rounds = slice(number, number + 1)
+            features = self._told(stage, rounds, planes, planes, heard, features, moves if last else None, on_block)
+        return moves, features
+
+    def landing(self, stage: Stage, theirs: Planes, sources: Tensor, on_block: Callable[[int], None]) -> Tensor:
+        """(M, 3) moves of points that hear of sources alone, whose planes and features (N, C) stay."""
+        heard = torch.stack([layer.hear(sources) for layer in stage.exchanges])
+        mine, features = self._seen(stage)
+        moves = torch.empty(len(features), 3)
+        self._told(stage, slice(None), mine, theirs, heard, features, moves, on_block)
+        return moves
+
+    def _seen(self, stage: Stage | None) -> tuple[Planes, Tensor]:
+        n = len(self.around_us.points)
+        planes, features = Planes(torch.empty(n, 3), torch.empty(n, 3)), torch.empty(n if stage else 0, fused.CHANNELS)
+        look = fused.looking(self.around_us, stage, planes, features)
+        each_block(look, n, self.threads, self.block_points)
+        return planes, features
+
+    def _told(
+        self, stage: Stage, rounds: slice, mine: Planes, theirs: Planes, heard: Tensor, before: Tensor,
+        moves: Tensor | None, on_block: Callable[[int], None],
+    ) -> Tensor:  # fmt: skip
+        features = torch.empty_like(before)
+        talk = fused.talking(self.around_us, stage, rounds, (mine.normal, theirs.normal), heard, before, features, moves)
+
+        def told(block: slice) -> None:
+            talk(block)
+            on_block((block.stop - block.start) * len(heard))
+
+        each_block(told, len(before), self.threads, self.block_points)
+        return features

@@ -1,0 +1,334 @@
+/* The projection network's inference, point by point: a point's edges never leave the first cache.
+
+   The same arithmetic as networks/projection.py and exchange.py, which say what it means; this is only where nobody learns.
+   Not here: neighbour search, blocks, threads. Everything is float32 but positions and covariances, which are float64.
+   Arrays are dense and row by row; weights of a layer come as (inputs, outputs), then its bias. */
+
+#include <Python.h>
+
+#include <math.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+
+#define CHANNELS 32
+#define LANES 8
+#define VECTORS (CHANNELS / LANES)
+#define EDGE_FEATURES 8
+#define POINT_FEATURES 4
+#define MOST_NEIGHBOURS 64
+#define KERNEL_SHARE 0.7f
+
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12
+#define ANY_PROCESSOR __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
+#else
+#define ANY_PROCESSOR
+#endif
+#if defined(_WIN32)
+#define EXPORT __declspec(dllexport)
+#else
+#define EXPORT __attribute__((visibility("default")))
+#endif
+#define INLINE static inline __attribute__((always_inline))
+
+typedef float Lanes __attribute__((vector_size(LANES * sizeof(float)), aligned(4), may_alias));
+typedef int32_t Mask __attribute__((vector_size(LANES * sizeof(int32_t)), aligned(4), may_alias));
+typedef struct { Lanes part[VECTORS]; } Channels;
+
+typedef struct {
+    int k;
+    float scale;                                               /* in the points' unit; everything else is in units of it */
+    float x[MOST_NEIGHBOURS], y[MOST_NEIGHBOURS], z[MOST_NEIGHBOURS];  /* source minus point */
+    float weight[MOST_NEIGHBOURS];                             /* of sum one */
+} Neighbourhood;
+
+typedef struct {
+    float edge[EDGE_FEATURES][CHANNELS], edge_bias[CHANNELS];
+    float own[CHANNELS][CHANNELS];
+    float message[CHANNELS][CHANNELS], message_bias[CHANNELS];
+    float update[2 * CHANNELS][CHANNELS], update_bias[CHANNELS];
+    float norm_gain[CHANNELS], norm_bias[CHANNELS];
+} Round;
+
+typedef struct { float weight[POINT_FEATURES][CHANNELS], bias[CHANNELS]; } Embedding;
+typedef struct { float weight[3][CHANNELS], bias[3]; } Head;
+
+INLINE float larger(float one, float other) { return one > other ? one : other; }
+INLINE double larger64(double one, double other) { return one > other ? one : other; }
+
+INLINE Channels load(const float *from) {
+    Channels c;
+    for (int v = 0; v < VECTORS; v++) c.part[v] = ((const Lanes *)from)[v];
+    return c;
+}
+
+INLINE void store(float *to, Channels c) {
+    for (int v = 0; v < VECTORS; v++) ((Lanes *)to)[v] = c.part[v];
+}
+
+INLINE Channels not_negative(Channels c) { /* a NaN stays one */
+    for (int v = 0; v < VECTORS; v++) c.part[v] = (Lanes)((Mask)c.part[v] & ~(c.part[v] < 0));
+    return c;
+}
+
+INLINE Channels plus(Channels sum, Channels c) {
+    for (int v = 0; v < VECTORS; v++) sum.part[v] += c.part[v];
+    return sum;
+}
+
+INLINE Channels plus_scaled(Channels sum, float factor, Channels c) {
+    for (int v = 0; v < VECTORS; v++) sum.part[v] += factor * c.part[v];
+    return sum;
+}
+
+INLINE Channels layer(Channels sum, const float *input, int n, const float *weight) {
+    for (int i = 0; i < n; i++) sum = plus_scaled(sum, input[i], load(weight + i * CHANNELS));
+    return sum;
+}
+
+INLINE void neighbourhood(Neighbourhood *near, const double *point, const double *sources, const int32_t *index,
+                          const float *count, int k) {
+    near->k = k;
+    for (int j = 0; j < k; j++) {
+        const double *source = sources + 3 * (size_t)index[j];
+        near->x[j] = (float)(source[0] - point[0]);
+        near->y[j] = (float)(source[1] - point[1]);
+        near->z[j] = (float)(source[2] - point[2]);
+    }
+    const float x = near->x[k - 1], y = near->y[k - 1], z = near->z[k - 1];
+    near->scale = KERNEL_SHARE * larger(sqrtf(x * x + y * y + z * z), 1e-12f);
+    const float unit = 1 / near->scale;
+    float sum = 0;
+    for (int j = 0; j < k; j++) {
+        near->x[j] *= unit, near->y[j] *= unit, near->z[j] *= unit;
+        const float squared = near->x[j] * near->x[j] + near->y[j] * near->y[j] + near->z[j] * near->z[j];
+        const float falling = larger(1 - KERNEL_SHARE * KERNEL_SHARE * squared, 0);
+        near->weight[j] = expf(-squared) * falling * falling * (count ? count[index[j]] : 1);
+        sum += near->weight[j];
+    }
+    for (int j = 0; j < k; j++) near->weight[j] /= larger(sum, 1e-12f);
+}
+
+INLINE void cross(double *result, const double *u, const double *v) {
+    result[0] = u[1] * v[2] - u[2] * v[1];
+    result[1] = u[2] * v[0] - u[0] * v[2];
+    result[2] = u[0] * v[1] - u[1] * v[0];
+}
+
+INLINE double dot(const double *u, const double *v) { return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]; }
+
+/* As smallest_eigenvector in projection.py: ascending eigenvalues, and the unit eigenvector of the smallest. */
+INLINE void smallest_eigenvector(const double matrix[3][3], double *eigenvalues, double *vector) {
+    const double mean = (matrix[0][0] + matrix[1][1] + matrix[2][2]) / 3;
+    double rows[3][3], squared = 0;
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) {
+            rows[i][j] = matrix[i][j] - (i == j ? mean : 0);
+            squared += rows[i][j] * rows[i][j];
+        }
+    const double size = larger64(sqrt(squared / 6), 1e-150);
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) rows[i][j] /= size;
+    double normal[3];
+    cross(normal, rows[1], rows[2]);
+    const double half = dot(rows[0], normal) / 2;
+    const double angle = acos(half < -1 ? -1 : half > 1 ? 1 : half) / 3, third = 2.0943951023931953;
+    const double least = 2 * cos(angle + third);
+    eigenvalues[0] = mean + size * least;
+    eigenvalues[1] = mean + size * 2 * cos(angle + 2 * third);
+    eigenvalues[2] = mean + size * 2 * cos(angle);
+    for (int i = 0; i < 3; i++) rows[i][i] -= least;
+    double crosses[3][3], longest = -1;
+    int best = 0;
+    cross(crosses[0], rows[0], rows[1]);
+    cross(crosses[1], rows[0], rows[2]);
+    cross(crosses[2], rows[1], rows[2]);
+    for (int i = 0; i < 3; i++) {
+        const double length = sqrt(dot(crosses[i], crosses[i]));
+        if (length > longest) longest = length, best = i;
+    }
+    memcpy(vector, crosses[best], sizeof crosses[best]);
+    if (longest < 1e-12) { /* all rows lie along the one large eigenvalue's vector: any direction across it will do */
+        int along = 0, axis = 0;
+        for (int i = 1; i < 3; i++)
+            if (dot(rows[i], rows[i]) > dot(rows[along], rows[along])) along = i;
+        for (int i = 1; i < 3; i++)
+            if (fabs(rows[along][i]) < fabs(rows[along][axis])) axis = i;
+        double unit[3] = {0, 0, 0};
+        unit[axis] = 1;
+        cross(vector, rows[along], unit);
+        longest = sqrt(dot(vector, vector));
+    }
+    for (int i = 0; i < 3; i++) vector[i] /= larger64(longest, 1e-150);
+}
+
+INLINE void plane(const Neighbourhood *near, float *normal, float *shape) {
+    double mean[3] = {0, 0, 0}, matrix[3][3], eigenvalues[3], vector[3];
+    double xx = 0, xy = 0, xz = 0, yy = 0, yz = 0, zz = 0;
+    for (int j = 0; j < near->k; j++) {
+        const double w = near->weight[j];
+        mean[0] += w * near->x[j], mean[1] += w * near->y[j], mean[2] += w * near->z[j];
+    }
+    for (int j = 0; j < near->k; j++) {
+        const double w = near->weight[j], x = near->x[j] - mean[0], y = near->y[j] - mean[1], z = near->z[j] - mean[2];
+        xx += w * x * x, xy += w * x * y, xz += w * x * z, yy += w * y * y, yz += w * y * z, zz += w * z * z;
+    }
+    matrix[0][0] = xx, matrix[1][1] = yy, matrix[2][2] = zz;
+    matrix[0][1] = matrix[1][0] = xy, matrix[0][2] = matrix[2][0] = xz, matrix[1][2] = matrix[2][1] = yz;
+    smallest_eigenvector(matrix, eigenvalues, vector);
+    for (int i = 0; i < 3; i++) {
+        normal[i] = (float)vector[i];
+        shape[i] = near->scale * (float)sqrt(larger64(eigenvalues[i], 0));
+    }
+}
+
+/* Planes and first features of the points in rows [start, stop). */
+EXPORT ANY_PROCESSOR void look(const double *points, const double *sources, const int32_t *index, const float *count,
+                               int k, float noise, int64_t start, int64_t stop, const Embedding *embedding,
+                               float *normals, float *shapes, float *features) {
+    Neighbourhood near;
+    for (int64_t i = start; i < stop; i++) {
+        float *shape = shapes + 3 * i;
+        neighbourhood(&near, points + 3 * i, sources, index + i * k, count, k);
+        plane(&near, normals + 3 * i, shape);
+        if (!embedding) continue;
+        const float thin = shape[0] / near.scale, middle = shape[1] / near.scale, wide = shape[2] / near.scale;
+        const float level = noise / near.scale;
+        const float known[POINT_FEATURES] = {2 * thin, 2 * (wide - middle), 4 * level / (1 + level), thin / (thin + level + 1e-6f)};
+        store(features + CHANNELS * i, layer(load(embedding->bias), known, POINT_FEATURES, embedding->weight[0]));
+    }
+}
+
+typedef struct {
+    float feature[MOST_NEIGHBOURS][EDGE_FEATURES];
+    float a[MOST_NEIGHBOURS], b[MOST_NEIGHBOURS];  /* height over my plane, height of the neighbour's plane over me */
+    float nx[MOST_NEIGHBOURS], ny[MOST_NEIGHBOURS], nz[MOST_NEIGHBOURS];
+} Edges;
+
+INLINE void edges(Edges *edge, const Neighbourhood *near, const float *own, const float *theirs, const int32_t *index, float noise) {
+    const float level = noise / near->scale + 0.02f;
+    for (int j = 0; j < near->k; j++) {
+        const float *normal = theirs + 3 * (size_t)index[j];
+        edge->nx[j] = normal[0], edge->ny[j] = normal[1], edge->nz[j] = normal[2];
+    }
+    for (int j = 0; j < near->k; j++) {
+        const float x = near->x[j], y = near->y[j], z = near->z[j];
+        const float a = x * own[0] + y * own[1] + z * own[2];
+        const float b = x * edge->nx[j] + y * edge->ny[j] + z * edge->nz[j];
+        const float cosine = edge->nx[j] * own[0] + edge->ny[j] * own[1] + edge->nz[j] * own[2];
+        const float high = fabsf(a), deep = fabsf(b);
+        float *feature = edge->feature[j];
+        feature[0] = sqrtf(larger(x * x + y * y + z * z, 1e-24f));
+        feature[1] = 4 * high;
+        feature[2] = 4 * deep;
+        feature[3] = cosine * cosine;
+        feature[4] = 16 * a * b * cosine;
+        feature[5] = high / (high + level);
+        feature[6] = deep / (deep + level);
+        feature[7] = 4 * sqrtf(near->weight[j] + 1e-4f);
+        edge->a[j] = a, edge->b[j] = b;
+    }
+}
+
+/* The messages of two edges, each a layer over its features, what both ends say added, and a second layer. Two at a time share
+   every load of a weight and keep eight sums going, as many as the processor's multipliers take to be busy. */
+INLINE void say(const Round *round, const float *const feature[2], Channels own, const float *const heard[2], float *const message[2]) {
+    Channels one = plus(own, load(heard[0])), other = plus(own, load(heard[1]));
+    float hidden[2][CHANNELS];
+    for (int i = 0; i < EDGE_FEATURES; i++) {
+        const Channels weight = load(round->edge[i]);
+        one = plus_scaled(one, feature[0][i], weight), other = plus_scaled(other, feature[1][i], weight);
+    }
+    store(hidden[0], not_negative(one)), store(hidden[1], not_negative(other));
+    one = other = load(round->message_bias);
+    for (int i = 0; i < CHANNELS; i++) {
+        const Channels weight = load(round->message[i]);
+        one = plus_scaled(one, hidden[0][i], weight), other = plus_scaled(other, hidden[1][i], weight);
+    }
+    store(message[0], not_negative(one)), store(message[1], not_negative(other));
+}
+
+/* One exchange: (K, C) messages, and the point's features replaced by what it makes of them. */
+INLINE void exchange(const Round *round, const Neighbourhood *near, const Edges *edge, const int32_t *index,
+                     const float *heard, float *features, float messages[][CHANNELS]) {
+    const Channels own = layer(load(round->edge_bias), features, CHANNELS, round->own[0]);
+    Channels mean = {{{0}}}, most = {{{0}}};
+    float most_weight = 1e-12f;
+    for (int j = 0; j < near->k; j++) most_weight = larger(most_weight, near->weight[j]);
+    for (int j = 0; j < near->k; j += 2) {
+        const int other = j + 1 < near->k ? j + 1 : j; /* the last of an odd number is made twice */
+        const float *const feature[2] = {edge->feature[j], edge->feature[other]};
+        const float *const said[2] = {heard + CHANNELS * (size_t)index[j], heard + CHANNELS * (size_t)index[other]};
+        float *const message[2] = {messages[j], messages[other]};
+        say(round, feature, own, said, message);
+    }
+    for (int j = 0; j < near->k; j++) {
+        const Channels message = load(messages[j]);
+        const float weight = near->weight[j], share = weight / most_weight;
+        for (int v = 0; v < VECTORS; v++) {
+            const Lanes shared = share * message.part[v];
+            const Mask more = shared > most.part[v];
+            mean.part[v] += weight * message.part[v];
+            most.part[v] = (Lanes)(((Mask)shared & more) | ((Mask)most.part[v] & ~more));
+        }
+    }
+    float pooled[2 * CHANNELS], news[CHANNELS], average = 0, variance = 0;
+    store(pooled, mean);
+    store(pooled + CHANNELS, most);
+    store(news, layer(load(round->update_bias), pooled, 2 * CHANNELS, round->update[0]));
+    for (int c = 0; c < CHANNELS; c++) average += (news[c] += features[c]);
+    average /= CHANNELS;
+    for (int c = 0; c < CHANNELS; c++) variance += (news[c] - average) * (news[c] - average);
+    const float sharpen = 1 / sqrtf(variance / CHANNELS + 1e-5f);
+    for (int c = 0; c < CHANNELS; c++)
+        features[c] = (news[c] - average) * sharpen * round->norm_gain[c] + round->norm_bias[c];
+}
+
+INLINE void step(const Head *head, const Neighbourhood *near, const Edges *edge, const float *own,
+                 float messages[][CHANNELS], float *move) {
+    float total = 0, lifted = 0, x = 0, y = 0, z = 0;
+    for (int j = 0; j < near->k; j++) {
+        float known[3];
+        for (int h = 0; h < 3; h++) {
+            float sum = 0;
+            for (int c = 0; c < CHANNELS; c++) sum += head->weight[h][c] * messages[j][c];
+            known[h] = sum + head->bias[h];
+        }
+        const float weight = near->weight[j] * expf(4 * tanhf(known[0] / 4));
+        const float pull = weight * (0.5f + known[1]) * edge->b[j];
+        total += weight;
+        x += pull * edge->nx[j], y += pull * edge->ny[j], z += pull * edge->nz[j];
+        lifted += weight * (0.5f + known[2]) * edge->a[j];
+    }
+    const float length = near->scale / larger(total, 1e-12f);
+    move[0] = length * (x + lifted * own[0]);
+    move[1] = length * (y + lifted * own[1]);
+    move[2] = length * (z + lifted * own[2]);
+}
+
+/* Rounds of messages of the points in rows [start, stop), and their step where there is a head.
+
+   `heard` holds what the sources say in each round, one array after the other, `n_heard` floats each. */
+EXPORT ANY_PROCESSOR void talk(const double *points, const double *sources, const int32_t *index, const float *count,
+                               int k, float noise, int64_t start, int64_t stop, const float *normals, const float *their_normals,
+                               const Round *rounds, int n_rounds, const float *heard, int64_t n_heard,
+                               const float *before, float *features, const Head *head, float *moves) {
+    Neighbourhood near;
+    Edges edge;
+    float messages[MOST_NEIGHBOURS][CHANNELS];
+    for (int64_t i = start; i < stop; i++) {
+        const int32_t *row = index + i * k;
+        float own[CHANNELS];
+        neighbourhood(&near, points + 3 * i, sources, row, count, k);
+        edges(&edge, &near, normals + 3 * i, their_normals, row, noise);
+        memcpy(own, before + CHANNELS * i, sizeof own);
+        for (int r = 0; r < n_rounds; r++) exchange(rounds + r, &near, &edge, row, heard + r * n_heard, own, messages);
+        memcpy(features + CHANNELS * i, own, sizeof own);
+        if (head) step(head, &near, &edge, normals + 3 * i, messages, moves + 3 * i);
+    }
+}
+
+/* Nothing is called by Python itself: fused.py takes the two functions above from the library. */
+static struct PyModuleDef module = {PyModuleDef_HEAD_INIT, "_fused", NULL, -1, NULL, NULL, NULL, NULL, NULL};
+
+PyMODINIT_FUNC PyInit__fused(void) { return PyModule_Create(&module); }
