@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +13,9 @@ from known_clouds import SURFACES, UTM, ball, cloud, model, moves, rms
 from pcdenoise.cloud.neighbours import spatial_order
 from pcdenoise.cloud.noise_level import NoiseLevel
 from pcdenoise.denoising.pyramid import Descent, Seeds, coarsen, descend, share_of_seeds
+from pcdenoise.errors import ModelError
+from pcdenoise.networks import fused, store
+from pcdenoise.networks.projection import ProjectionNetwork
 
 N = 6000
 
@@ -136,6 +141,38 @@ def test_the_result_does_not_depend_on_the_number_of_threads() -> None:
         one, two = (descend(network, points, count, None, noisy.spacing, block_points=200, threads=n) for n in (1, 2))
     np.testing.assert_allclose(two.seeds[-1], one.seeds[-1], atol=1e-6)
     np.testing.assert_allclose(two.trust, one.trust, atol=1e-6)
+
+
+@pytest.mark.skipif(fused.library() is None, reason="was installed where no C compiler is")
+@pytest.mark.parametrize("name", ["default", "unsupervised"])
+@pytest.mark.parametrize("share", [1, 0.2])
+def test_compiled_code_and_torch_agree(name: str, share: float, rng: np.random.Generator) -> None:
+    # Both round to float32; a hundred-thousandth of the spacing is a hundred times less than a scanner's last digit.
+    noisy, network = cloud("torus", 1501, 1.0), store.load(name).network
+    assert isinstance(network, ProjectionNetwork)
+    points = ordered(noisy.noisy)
+    coarse = (
+        coarsen(points, share, threads=1) if share < 1 else Seeds(points, rng.integers(1, 9, 1501).astype(float), np.arange(1501))
+    )
+    raw = points if share < 1 else None
+    by_torch = descend(network, coarse.points, coarse.count, raw, noisy.spacing, threads=1)
+    with torch.no_grad():
+        assert fused.runs(network)
+        compiled = descend(network, coarse.points, coarse.count, raw, noisy.spacing, threads=2, block_points=400)
+    np.testing.assert_allclose(compiled.trust, by_torch.trust, atol=1e-5)
+    for one, other in zip([*compiled.seeds, compiled.landed], [*by_torch.seeds, by_torch.landed], strict=True):
+        if one is not None and other is not None:
+            assert moves(one.numpy(), other.detach().numpy()).max() < 1e-5 * noisy.spacing
+    last = compiled.seeds[-1] if compiled.landed is None else compiled.landed
+    assert np.median(moves(points, last.numpy())) > 0.1 * noisy.spacing
+
+
+def test_compiled_code_lets_broken_weights_be_seen() -> None:
+    noisy, network = cloud("torus", 500, 1.0), copy.deepcopy(model("seeded").network)
+    with torch.no_grad():
+        network.among[0].exchanges[0].message.weight[3, 4] = torch.nan
+        with pytest.raises(ModelError, match="not numbers"):
+            descend(network, ordered(noisy.noisy), None, None, noisy.spacing, threads=1)
 
 
 def test_far_from_the_origin_the_same_points_take_the_same_steps() -> None:

@@ -132,8 +132,11 @@ def descend(
     features: Tensor | None = None
     stages: list[Tensor] = []
     surface = torch.ones(0)
+    known_neighbours: Tensor | None = None  # points that are their own seeds hardly move: they keep their neighbours
     for stage in network.among:
-        looking = kind(points, points, weights, k, noise, block_points, threads)
+        looking = kind(points, points, weights, k, noise, block_points, threads, known_neighbours)
+        if raw is None:
+            known_neighbours = looking.index
         own, known = looking.around(stage)
         surface = surface if stages else trust(own, noise)
         features = known if features is None else features + known
@@ -157,15 +160,21 @@ def _numbers(points: Tensor) -> Tensor:
     return points
 
 
+def _nearest(points: Tensor, sources: Tensor, k: int, threads: int) -> Tensor:
+    """(M, K) int32 rows of the sources nearest to each point."""
+    return torch.from_numpy(NeighbourSearch(sources.detach().numpy(), threads).nearest(points.detach().numpy(), k))
+
+
 class _Looking:
     """M points that look at their nearest sources, block by block; with a single block nothing is computed twice."""
 
     def __init__(
-        self, points: Tensor, sources: Tensor, count: Tensor | None, k: int, noise: float, block_points: int, threads: int
-    ) -> None:
+        self, points: Tensor, sources: Tensor, count: Tensor | None, k: int, noise: float, block_points: int, threads: int,
+        index: Tensor | None = None,
+    ) -> None:  # fmt: skip
         self.points, self.sources, self.count, self.noise = points, sources, count, noise
         self.block_points, self.threads = block_points, threads
-        self.index = torch.from_numpy(NeighbourSearch(sources.detach().numpy(), threads).nearest(points.detach().numpy(), k))
+        self.index = _nearest(points, sources, k, threads) if index is None else index
         self._only: Edges | None = None
         self._only_features: tuple[Tensor, Tensor, Tensor] | None = None
 
@@ -247,10 +256,11 @@ class _Fused:
     """What `_Looking` does, in compiled code: no edge is ever written to memory, so blocks are large."""
 
     def __init__(
-        self, points: Tensor, sources: Tensor, count: Tensor | None, k: int, noise: float, block_points: int, threads: int
-    ) -> None:
-        index = torch.from_numpy(NeighbourSearch(sources.numpy(), threads).nearest(points.numpy(), k))
-        self.around_us = fused.Surroundings(points.contiguous(), sources.contiguous(), index, count, noise)
+        self, points: Tensor, sources: Tensor, count: Tensor | None, k: int, noise: float, block_points: int, threads: int,
+        index: Tensor | None = None,
+    ) -> None:  # fmt: skip
+        self.index = _nearest(points, sources, k, threads) if index is None else index
+        self.around_us = fused.Surroundings(points.contiguous(), sources.contiguous(), self.index, count, noise)
         self.block_points, self.threads = block_points, threads
 
     def planes(self) -> Planes:

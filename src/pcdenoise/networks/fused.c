@@ -95,8 +95,10 @@ INLINE void neighbourhood(Neighbourhood *near, const double *point, const double
         near->y[j] = (float)(source[1] - point[1]);
         near->z[j] = (float)(source[2] - point[2]);
     }
-    const float x = near->x[k - 1], y = near->y[k - 1], z = near->z[k - 1];
-    near->scale = KERNEL_SHARE * larger(sqrtf(x * x + y * y + z * z), 1e-12f);
+    float furthest = 0;
+    for (int j = 0; j < k; j++)
+        furthest = larger(furthest, near->x[j] * near->x[j] + near->y[j] * near->y[j] + near->z[j] * near->z[j]);
+    near->scale = KERNEL_SHARE * larger(sqrtf(furthest), 1e-12f);
     const float unit = 1 / near->scale;
     float sum = 0;
     for (int j = 0; j < k; j++) {

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
-from typing import NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -19,11 +20,11 @@ from pcdenoise.networks.projection import Planes, ProjectionNetwork, Stage
 
 CHANNELS, MOST_NEIGHBOURS = 32, 64
 """What the compiled code is made for."""
-_EXTENSION = "pcdenoise.networks._fused"
 _Integer, _Real, _Address = ctypes.c_int64, ctypes.c_float, ctypes.c_void_p
 
 
-class Surroundings(NamedTuple):
+@dataclass(frozen=True)
+class Surroundings:
     """M points that look at K sources each: points (M, 3), sources (N, 3) float64, index (M, K) int32, count (N,) or None."""
 
     points: Tensor
@@ -35,15 +36,15 @@ class Surroundings(NamedTuple):
 
 @lru_cache(maxsize=1)
 def library() -> ctypes.CDLL | None:
-    """The compiled code, or None where it was not built."""
-    found = find_spec(_EXTENSION)
+    """The library, whose calls leave the interpreter to other threads; None where it was not built or is another system's."""
+    found = find_spec("pcdenoise.networks._fused")
     if found is None or found.origin is None:
         return None
     try:
         compiled = ctypes.CDLL(found.origin)
-    except OSError:  # built for another system
+    except OSError:
         return None
-    around = [*[_Address] * 4, ctypes.c_int, _Real, _Integer, _Integer]
+    around: list[Any] = [*[_Address] * 4, ctypes.c_int, _Real, _Integer, _Integer]
     compiled.look.argtypes = [*around, *[_Address] * 4]
     compiled.talk.argtypes = [*around, *[_Address] * 3, ctypes.c_int, _Address, _Integer, *[_Address] * 4]
     compiled.look.restype = compiled.talk.restype = None
@@ -106,8 +107,8 @@ def _packed(layer: nn.Module) -> Tensor:
 
 
 def _given(around: Surroundings) -> Sequence[int | float | None]:
-    points, sources, index, count, noise = around
-    return _at(points), _at(sources), _at(index), _at(count), index.shape[1], noise
+    arrays = (around.points, around.sources, around.index, around.count)
+    return *map(_at, arrays), around.index.shape[1], around.noise
 
 
 def _at(values: Tensor | None) -> int | None:

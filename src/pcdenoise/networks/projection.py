@@ -16,7 +16,7 @@ from pcdenoise.networks.exchange import exchange
 
 N_EDGE_FEATURES = 8
 N_POINT_FEATURES = 4
-_KERNEL_SHARE = 0.7  # the kernel's unit of length as a share of the distance to the last neighbour
+_KERNEL_SHARE = 0.7  # the kernel's unit of length as a share of the distance to the furthest neighbour
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Edges(NamedTuple):
     """M points that look at K sources each; everything is relative to the point, in units of its `scale`.
 
     offset (M, K, 3) source minus point; source (M, K) their rows; weight (M, K) kernel times the number of raw points
-    behind a source, zero at the last neighbour and of sum one; scale (M, 1) length unit in local units.
+    behind a source, zero at the furthest neighbour and of sum one; scale (M, 1) length unit in local units.
     """
 
     offset: Tensor
@@ -54,13 +54,14 @@ class Planes(NamedTuple):
 
 
 def edges(offset: Tensor, index: Tensor, count: Tensor | None) -> Edges:
-    """Kernel weights for neighbours sorted by distance. offset (M, K, 3) in any unit, count (N,) raw points per source or None.
+    """Kernel weights. offset (M, K, 3) in any unit, count (N,) raw points per source or None.
 
-    The kernel falls to zero at the last neighbour, so that nothing jumps when a point enters or leaves the neighbourhood.
+    The kernel falls to zero at the furthest neighbour, so that nothing jumps when a point enters or leaves the neighbourhood.
     """
     with torch.no_grad():
-        scale = _KERNEL_SHARE * offset[:, -1].norm(dim=-1, keepdim=True).clamp_min(1e-12)
-        squared = (offset / scale[:, :, None]).square().sum(-1)
+        squared = offset.square().sum(-1)
+        scale = _KERNEL_SHARE * squared.amax(-1, keepdim=True).sqrt().clamp_min(1e-12)
+        squared = squared / scale.square().clamp_min(1e-30)
         weight = torch.exp(-squared) * (1 - _KERNEL_SHARE**2 * squared).clamp_min(0).square()
         if count is not None:
             weight = weight * count.index_select(0, index.reshape(-1)).view(index.shape)
