@@ -34,17 +34,18 @@ KINDS = (*SCANS, "settings", "config", "weights")
 LARGEST_SEED = 16_384
 TIME_LIMIT_S, MEMORY_LIMIT_MB = 10, 2500
 TOKENS = {
-    "ply": ["format ascii 1.0", "format binary_big_endian 1.0", "element vertex 2", "property list uchar int a", "property double x",
-            "end_header", "comment", "4294967295", "1e309", "nan"],
-    "pcd": ["FIELDS x y z", "COUNT 1 1 1", "DATA ascii", "DATA binary_compressed", "WIDTH", "HEIGHT", "POINTS", "VIEWPOINT", "SIZE 8 8 8",
-            "TYPE F F F", "rgb", "99999999999"],
-    "xyz": ["//X Y Z", "nan", "-inf", "1e309", ";", ",", "\\x09", "\\x0d", "\\x22", "#", "\\xef\\xbb\\xbf"],
-    "las": ["LASF", "laszip encoded", "LASF_Spec", "LASF_Projection", "copc", "pcdenoise", "\\xff\\xff\\xff\\xff"],
-    "settings": ["iters = ", "[denoise]", "strength = nan", "1979-05-27", "inf", "\\x5cuD800", "[[denoise]]", "max-move = ", "'''"],
-    "config": ["\\x22settings\\x22", "\\x22channels\\x22", "NaN", "Infinity", "1e999", "null", "[[[[", "\\x5cud800"],
-    "weights": ["\\x22dtype\\x22", "\\x22F32\\x22", "\\x22F64\\x22", "\\x22BF16\\x22", "\\x22F8_E4M3\\x22", "\\x22BOOL\\x22", "\\x22C64\\x22",
-                "data_offsets", "__metadata__", "shape"],
-}  # fmt: skip
+    "ply": "format ascii 1.0|format binary_big_endian 1.0|element vertex 2|property list uchar int a|property double x|end_header|"
+    "comment|4294967295|1e309|nan",
+    "pcd": "FIELDS x y z|COUNT 1 1 1|DATA ascii|DATA binary_compressed|WIDTH|HEIGHT|POINTS|VIEWPOINT|SIZE 8 8 8|TYPE F F F|rgb|"
+    "99999999999",
+    "xyz": r"//X Y Z|nan|-inf|1e309|;|,|\x09|\x0d|\x22|#|\xef\xbb\xbf",
+    "las": r"LASF|laszip encoded|LASF_Spec|LASF_Projection|copc|pcdenoise|\xff\xff\xff\xff",
+    "settings": r"iters = |[denoise]|strength = nan|1979-05-27|inf|\x5cuD800|[[denoise]]|max-move = |'''",
+    "config": r"\x22settings\x22|\x22channels\x22|NaN|Infinity|1e999|null|[[[[|\x5cud800",
+    "weights": r"\x22dtype\x22|\x22F32\x22|\x22F64\x22|\x22BF16\x22|\x22F8_E4M3\x22|\x22BOOL\x22|\x22C64\x22|data_offsets|"
+    r"__metadata__|shape",
+}
+"""Words for libFuzzer to put in, by kind, with a bar between them."""
 TOKENS["laz"] = TOKENS["las"]
 
 
@@ -188,7 +189,7 @@ def fuzz(kind: str, folders: list[Path], seconds: int, keep: Path) -> None:
                 print(f"FOUND {kind}: {name}: {' '.join(str(fault).split())[:200]}; kept as {path}", file=sys.stderr, flush=True)
 
     words = work / "words.txt"
-    words.write_text("".join(f'"{token}"\n' for token in TOKENS.get(kind, ())))
+    words.write_text("".join(f'"{token}"\n' for token in TOKENS.get(kind, "").split("|") if token))
     limits = [
         f"-timeout={TIME_LIMIT_S}",
         f"-rss_limit_mb={MEMORY_LIMIT_MB}",
