@@ -112,6 +112,8 @@ def _chunk_table(raw: Raw, start: int, layout: bytes) -> list[tuple[int, int]]:
     if sum(size for _, size in chunks) > table - start - 8:
         raise lazrs.LazrsError("chunks larger than the file")
     if compressor == _LAYERED:
+        if not chunks:  # lazrs would read on past the table, into layers that nothing has checked
+            raise lazrs.LazrsError("an empty chunk table")
         _check_layers(raw, start + 8, chunks, layout)
     return chunks
 
