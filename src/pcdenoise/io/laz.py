@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdenoise.errors import ScanError
-from pcdenoise.io.files import Raw
+from pcdenoise.io.files import Raw, check_not_cut
 
 _ITEMS = 32  # where a layout counts its items
 _LAYERED = 3
@@ -39,18 +39,18 @@ def decompressed(
         item_length = lazrs.LazVlr(layout).item_size()
         if item_length != length:
             raise ScanError(f"{origin}: {length} bytes a point, {item_length} in the laszip VLR; the file is damaged")
-        chunks = _chunk_table(raw, start, layout)
+        chunks = _chunk_table(raw, start, layout, origin)
         most = _LARGEST_RATIO * (len(raw) - start) // length
         held = min(most, sum(n for n, _ in chunks)) if chunks else most
         if n_points > held:
             raise ScanError(
                 f"{origin}: header claims {n_points} points, the compressed data holds at most {held}; fetch it again"
             )
-        source = BytesIO(raw) if isinstance(raw, bytes) else _MappedFile(raw)
-        source.seek(start)
+        source = _as_file(raw, start, origin)
         in_parallel = chunks and max(n for n, _ in chunks) * length <= _LARGEST_CHUNK  # lazrs makes room for whole chunks
         decompressor = (lazrs.ParLasZipDecompressor if in_parallel else lazrs.LasZipDecompressor)(source, layout)
         for first in range(0, n_points, n_rows):
+            check_not_cut(raw, origin)
             records = np.empty((min(n_rows, n_points - first), length), np.uint8)
             decompressor.decompress_many(records.reshape(-1))
             yield records
@@ -67,8 +67,8 @@ def decompressed(
 class _MappedFile(RawIOBase):
     """A mapped file as a stream of its own place, since several may read it at once."""
 
-    def __init__(self, raw: mmap) -> None:
-        self.raw, self.at = raw, 0
+    def __init__(self, raw: mmap, origin: str) -> None:
+        self.raw, self.origin, self.at = raw, origin, 0
 
     def readable(self) -> bool:
         return True
@@ -84,13 +84,21 @@ class _MappedFile(RawIOBase):
         return self.at
 
     def readinto(self, buffer: Any) -> int:
+        check_not_cut(self.raw, self.origin)
         piece = self.raw[self.at : self.at + len(buffer)]
         buffer[: len(piece)] = piece
         self.at += len(piece)
         return len(piece)
 
 
-def _chunk_table(raw: Raw, start: int, layout: bytes) -> list[tuple[int, int]]:
+def _as_file(raw: Raw, at: int, origin: str) -> BytesIO | _MappedFile:
+    """A file of these bytes that stands at byte `at`, without a copy of them."""
+    source = BytesIO(raw) if isinstance(raw, bytes) else _MappedFile(raw, origin)
+    source.seek(at)
+    return source
+
+
+def _chunk_table(raw: Raw, start: int, layout: bytes, origin: str) -> list[tuple[int, int]]:
     """(points, bytes) of each compressed chunk; empty if the stream has no table. Raises LazrsError on sizes that cannot be true.
 
     Checked here because lazrs allocates what the file says, and an allocation that fails ends the process.
@@ -106,9 +114,7 @@ def _chunk_table(raw: Raw, start: int, layout: bytes) -> list[tuple[int, int]]:
     (n_chunks,) = struct.unpack_from("<I", raw, table + 4)
     if n_chunks > table - start:
         raise lazrs.LazrsError(f"a table of {n_chunks} chunks")
-    source = BytesIO(raw)
-    source.seek(start)
-    chunks: list[tuple[int, int]] = lazrs.read_chunk_table(source, lazrs.LazVlr(layout))
+    chunks: list[tuple[int, int]] = lazrs.read_chunk_table(_as_file(raw, start, origin), lazrs.LazVlr(layout))
     if sum(size for _, size in chunks) > table - start - 8:
         raise lazrs.LazrsError("chunks larger than the file")
     if compressor == _LAYERED:
