@@ -89,6 +89,24 @@ def test_files_that_once_gave_warnings_are_read_without_a_word(kind: str, raw: b
         assert len(READERS[kind](raw, "found")) > 0
 
 
+SIGNALLING = struct.pack("<I", 0x7F800001)
+"""A NaN that processors report when they convert it; sensors do write it."""
+
+
+@pytest.mark.parametrize("kind", ["bin", "ply", "pcd"])
+def test_nans_that_signal_are_read_without_a_word_and_come_back_bit_by_bit(kind: str) -> None:
+    heads = {"bin": "", "ply": PLY.replace("N", "2") + "property float q\nend_header\n"}
+    heads["pcd"] = PCD.replace("z\n", "z q\n").replace("4 4\n", "4 4 4\n").replace("F F\n", "F F F\n").replace("1 1\n", "1 1 1\n")
+    raw = heads[kind].replace("N\n", "2\n").encode() + 4 * SIGNALLING + struct.pack("<4f", 1, 2, 3, 4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scan = READERS[kind](raw, "found")
+        out = BytesIO()
+        {"bin": kitti, "ply": ply, "pcd": pcd}[kind].write(scan.moved_to(scan.points + 1), out)
+    assert out.getvalue()[:-16] == raw[:-16]
+    assert np.frombuffer(out.getvalue()[-16:], "<f4").tolist() == [2, 3, 4, 4]
+
+
 def test_a_wild_scale_of_an_extra_dimension_gives_infinities_without_a_word() -> None:
     records = np.array([(7,), (-7,), (0,)], dtype=[("depth", "<i4")])
     with warnings.catch_warnings():
