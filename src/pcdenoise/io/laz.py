@@ -35,6 +35,7 @@ def decompressed(
     """
     if n_points == 0:
         return
+    check_not_cut(raw, origin)
     try:
         item_length = lazrs.LazVlr(layout).item_size()
         if item_length != length:
@@ -50,7 +51,6 @@ def decompressed(
         in_parallel = chunks and max(n for n, _ in chunks) * length <= _LARGEST_CHUNK  # lazrs makes room for whole chunks
         decompressor = (lazrs.ParLasZipDecompressor if in_parallel else lazrs.LasZipDecompressor)(source, layout)
         for first in range(0, n_points, n_rows):
-            check_not_cut(raw, origin)
             records = np.empty((min(n_rows, n_points - first), length), np.uint8)
             decompressor.decompress_many(records.reshape(-1))
             yield records
