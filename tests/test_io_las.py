@@ -178,6 +178,16 @@ def test_laz_refuses_waveforms_that_lazrs_would_scramble_and_las_holds_them(rng:
         written(scan, compressed=True)
 
 
+@pytest.mark.parametrize("form", [4, 5])
+def test_waveform_packets_are_marked_as_laszip_marks_them(form: int) -> None:
+    """As lazrs marks them, LASzip refuses the file: "WAVEPACKET13 has version > 1"."""
+    raw = io_samples.las(3, form, n_extra=3)
+    packed = written(las.read(raw, "sample"), compressed=True)
+    assert struct.pack("<HHH", 9, 29, 1) in packed
+    assert struct.pack("<HHH", 9, 29, 2) not in packed
+    assert written(las.read(packed, "back"), compressed=False) == raw
+
+
 def test_laz_whose_chunk_table_stands_at_the_end_is_read() -> None:
     raw = io_samples.las(2, 1, compressed=True, n=200)
     start = int(las_file.parse(raw, "sample").field("points_start"))

@@ -21,6 +21,7 @@ from pcdenoise.io.files import Raw, check_not_cut
 
 _ITEMS = 32  # where a layout counts its items
 _LAYERED = 3
+_WAVEFORM_PACKET = b"\x09\x00"  # the item of formats 4 and 5; 9 and 10 have another
 _N_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # by item: point, RGB, RGB and NIR, waveform packet; extra bytes have one a byte
 _LARGEST_CHUNK = 64 << 20
 _LARGEST_RATIO = 5_000  # points all alike compress 3000 to 1 in chunks of 50000
@@ -138,12 +139,21 @@ def _check_layers(raw: Raw, at: int, chunks: list[tuple[int, int]], layout: byte
 
 def layout(point_format: int, n_extra: int, present: Sequence[bytes]) -> bytes:
     """How to compress points of a format with extra bytes: as one of the layouts present if lazrs can, else lazrs' default."""
-    default: bytes = lazrs.LazVlr.new_for_compression(point_format, n_extra).record_data()
+    default = _for_laszip(lazrs.LazVlr.new_for_compression(point_format, n_extra).record_data())
     for own in present:
         same_kind = own[:2] == default[:2] and own[_ITEMS:] == default[_ITEMS:]
         if same_kind and 0 < struct.unpack_from("<I", own, 12)[0] * lazrs.LazVlr(own).item_size() <= _LARGEST_CHUNK:
             return own
     return default
+
+
+def _for_laszip(layout: bytes) -> bytes:
+    """A layout of lazrs 0.8 as LASzip reads it: lazrs calls its way to compress waveform packets the second, LASzip the first."""
+    octets = bytearray(layout)
+    for at in range(_ITEMS + 2, len(octets), 6):
+        if octets[at : at + 2] == _WAVEFORM_PACKET:
+            octets[at + 4 : at + 6] = b"\1\0"
+    return bytes(octets)
 
 
 def compress(parts: Iterable[NDArray[np.uint8]], layout: bytes, file: BinaryIO, *, check: bool) -> None:
