@@ -84,7 +84,10 @@ def las(
     vlrs = list(vlrs)
     if compressed:
         laszip = lazrs.LazVlr.new_for_compression(point_format, length - _LENGTHS[point_format])
-        vlrs.append(vlr(b"laszip encoded", 22204, laszip.record_data(), b"http://laszip.org"))
+        layout = laszip.record_data()
+        if point_format in (4, 5):  # LASzip calls the way to compress waveform packets the first, lazrs the second
+            layout = layout.replace(struct.pack("<HHH", 9, 29, 2), struct.pack("<HHH", 9, 29, 1))
+        vlrs.append(vlr(b"laszip encoded", 22204, layout, b"http://laszip.org"))
     size = _HEADER_SIZES[minor]
     points_start = size + sum(map(len, vlrs)) + len(gap)
     body = BytesIO()

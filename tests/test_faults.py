@@ -19,6 +19,10 @@ import pytest
 import pcdenoise
 from pcdenoise import whole_files
 from pcdenoise.commands import main
+from pcdenoise.commands.files import Job
+from pcdenoise.commands.processes import in_processes
+from pcdenoise.commands.workers import Figures
+from pcdenoise.denoising import tiles
 from pcdenoise.errors import PcdenoiseError, of_the_system
 from pcdenoise.io import files
 from pcdenoise.networks import store
@@ -206,6 +210,33 @@ def test_a_second_kill_does_not_disturb_the_tidying_up(monkeypatch: pytest.Monke
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_while_a_library_makes_its_classes_is_no_bug(
+    number: int, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Python 3.11 makes a RuntimeError of what is raised in __set_name__, and a traceback was printed."""
+
+    class Slow:
+        def __set_name__(self, owner: type, name: str) -> None:
+            os.kill(os.getpid(), number)
+
+    def loads(**_: object) -> None:
+        type("Library", (), {"slow": Slow()})
+
+    monkeypatch.setattr("pcdenoise.commands.app", loads)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        found: object = main([])
+    except SystemExit as stop:
+        found = stop.code
+    except KeyboardInterrupt:  # from 3.12 on, as it is; Typer catches that one
+        found = 130
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert found == code
+    assert "Traceback" not in capsys.readouterr().err
+
+
 def test_a_signal_that_was_ignored_stays_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
     try:
@@ -295,6 +326,172 @@ def test_a_name_that_is_no_utf8_is_shown_and_reported(scan: Path, capsys: pytest
         )
         assert b"\\udcff" in report.read_bytes() or suffix == "html"  # a page names no file
     assert scan.with_name("\udcff_c.xyz").exists()
+
+
+# Scans in cells, and in workers
+
+IN_CELLS = ["--tile", "1000", "--threads", "1", *FAST]
+
+
+def surface(folder: Path, format: str, n: int = 3000) -> Path:
+    """A noisy wave of n points."""
+    rng = np.random.default_rng(3)
+    x, y = rng.random((2, n))
+    path = folder / f"wave.{format}"
+    pcdenoise.write(pcdenoise.Scan(np.column_stack([x, y, 0.1 * np.sin(6 * x) + rng.normal(0, 0.005, n)]).round(5)), path)
+    return path
+
+
+def undisturbed(path: Path, folder: Path) -> bytes:
+    """What cells make of a scan, nothing in the way."""
+    target = folder / f"undisturbed{path.suffix}"
+    assert main(["denoise", str(path), "-o", str(target), *IN_CELLS]) == 0
+    return target.read_bytes()
+
+
+@pytest.mark.parametrize("moment", ["after the plan", "while it is written"])
+@pytest.mark.parametrize("harm", ["cut", "emptied", "changed", "longer"])
+@pytest.mark.parametrize("format", ["las", "laz", "ply", "xyz"])
+def test_an_input_that_is_cut_or_changed_between_passes_is_one_line_and_the_next_run_starts_anew(
+    format: str, harm: str, moment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The file is mapped: a look beyond its new end would end the process; rows that changed would be put into other cells."""
+    path, out = surface(tmp_path, format), tmp_path / f"out.{format}"
+    raw, expected = path.read_bytes(), undisturbed(path, tmp_path)
+    name = "level" if moment == "after the plan" else "rows"
+    sound = getattr(tiles.Tiles, name)
+
+    def harmed(job: tiles.Tiles, *number: int) -> object:
+        found = sound(job, *number)
+        if path.read_bytes() == raw:
+            with path.open("rb+") as file:
+                file.truncate({"cut": len(raw) // 2, "emptied": 0}.get(harm, len(raw)))
+                if harm in ("changed", "longer"):
+                    file.seek(-1 if harm == "changed" else 0, 2)
+                    file.write(b"7")
+            os.utime(path, ns=(0, path.stat().st_mtime_ns + 1))
+        return found
+
+    with monkeypatch.context() as patch:
+        patch.setattr(tiles.Tiles, name, harmed)
+        assert main(["denoise", str(path), "-o", str(out), *IN_CELLS]) == 3
+    said = one_line(capsys.readouterr().err)
+    assert f"wave.{format}: " in said
+    assert "while it was" in said
+    assert not out.exists()
+    path.write_bytes(raw)
+    assert main(["denoise", str(path), "-o", str(out), *IN_CELLS, "--resume"]) == 0
+    assert out.read_bytes() == expected
+    assert not [one.name for one in tmp_path.iterdir() if one.name.startswith(".")]
+
+
+_CELLS_ON_A_SMALL_DISK = """
+import resource, sys
+from pcdenoise.commands import main
+for size in (10_000, 25_000, 30_000, 120_000, -1):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, -1))
+    print(main(sys.argv[1:]), flush=True)
+"""
+
+
+def test_a_disk_that_fills_while_cells_are_cleaned_is_one_line_and_resuming_gives_the_same_bytes(tmp_path: Path) -> None:
+    path = surface(tmp_path, "ply")
+    expected, out = undisturbed(path, tmp_path), tmp_path / "out.ply"
+    done = subprocess.run(
+        [sys.executable, "-c", _CELLS_ON_A_SMALL_DISK, "denoise", path, "-o", out, *IN_CELLS, "--resume"],
+        capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT / "src")}, timeout=300, check=False,
+    )  # fmt: skip
+    codes = done.stdout.split()
+    assert codes[:2] == ["3", "3"], done.stderr
+    assert codes[-1] == "0"
+    assert done.stderr.count("\n") == codes.count("3")
+    assert "File too large" in done.stderr
+    assert out.read_bytes() == expected
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["out.ply", "undisturbed.ply", "wave.ply"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_while_cells_are_cleaned_leaves_them_for_resume(
+    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, out = surface(tmp_path, "las"), tmp_path / "out.las"
+    expected = undisturbed(path, tmp_path)
+    clean = tiles.Tiles.clean
+    cleaned: list[int] = []
+
+    def interrupted(job: tiles.Tiles, cell: int, *rest: object) -> None:
+        if len(cleaned) == 1:
+            os.kill(os.getpid(), number)
+        clean(job, cell, *rest)  # type: ignore[arg-type]
+        cleaned.append(cell)
+
+    monkeypatch.setattr(tiles.Tiles, "clean", interrupted)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        code = main(["denoise", str(path), "-o", str(out), *IN_CELLS])
+    except SystemExit as stop:
+        code = int(stop.code or 0)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert code == 128 + number
+    assert not out.exists()
+    cells = tmp_path / ".out.las.cells"
+    kept = {one: one.stat().st_mtime_ns for one in cells.glob("pass_1/*.f64")}
+    assert len(kept) == 1
+    monkeypatch.setattr(tiles.Tiles, "clean", clean)
+    monkeypatch.setattr(tiles.Tiles, "remove", lambda job: None)
+    assert main(["denoise", str(path), "-o", str(out), *IN_CELLS, "--resume"]) == 0
+    assert {one: one.stat().st_mtime_ns for one in kept} == kept, "cleaned again"
+    assert out.read_bytes() == expected
+
+
+@pytest.mark.parametrize("damage", [b"", b"{", b"[]", b"{}", b"\xff", b'{"job": {}, "cell_points": "x"}'])
+def test_a_plan_of_cells_that_is_damaged_is_made_anew(damage: bytes, tmp_path: Path) -> None:
+    path = surface(tmp_path, "ply")
+    expected, cells = undisturbed(path, tmp_path), tmp_path / ".out.ply.cells"
+    (cells / "pass_1").mkdir(parents=True)
+    (cells / "plan.json").write_bytes(damage)
+    (cells / "pass_1" / "0.f64").write_bytes(b"of another scan")
+    assert main(["denoise", str(path), "-o", str(tmp_path / "out.ply"), *IN_CELLS, "--resume"]) == 0
+    assert (tmp_path / "out.ply").read_bytes() == expected
+
+
+@pytest.mark.parametrize("target", ["/proc/none/out.ply", "{folder}/wave.ply/out.ply"])
+def test_cells_where_nothing_can_be_written_are_one_line(target: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = surface(tmp_path, "ply")
+    assert main(["denoise", str(path), "-o", target.format(folder=tmp_path), *IN_CELLS]) == 3
+    one_line(capsys.readouterr().err)
+    assert [one.name for one in tmp_path.iterdir()] == ["wave.ply"]
+
+
+def work_with_faults(job: Job) -> Figures:
+    """What a worker may meet, by the name of the input."""
+    if job.source.name == "memory":
+        resource = pytest.importorskip("resource")
+        size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        limit = resource.getrlimit(resource.RLIMIT_AS)
+        resource.setrlimit(resource.RLIMIT_AS, (size + (64 << 20), limit[1]))
+        try:
+            np.ones(1 << 28)
+        finally:
+            resource.setrlimit(resource.RLIMIT_AS, limit)
+    elif job.source.name == "killed":
+        part = job.target.with_name(f".{job.target.name}.part").open("wb")  # as `replaced` would, and open to the end
+        part.write(b"half")
+        part.flush()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return {"points": 1}
+
+
+def test_workers_out_of_memory_or_killed_twice_fail_their_input_alone(tmp_path: Path) -> None:
+    jobs = [Job(Path(name), tmp_path / "out" / name) for name in ("a", "memory", "b", "killed", "c")]
+    (tmp_path / "out").mkdir()
+    found = {outcome.job.source.name: outcome for outcome in in_processes(2)(jobs, work_with_faults)}
+    assert found.keys() == {"a", "b", "c", "memory", "killed"}
+    assert {name for name, outcome in found.items() if outcome.error is None} == {"a", "b", "c"}
+    assert "memory: out of memory" in str(found["memory"].error)
+    assert "killed: its worker was killed twice" in str(found["killed"].error)
+    assert not list((tmp_path / "out").iterdir())
 
 
 def test_a_model_that_cannot_be_saved_leaves_the_old_one(tmp_path: Path) -> None:

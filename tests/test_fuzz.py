@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 import struct
 import subprocess
@@ -89,6 +90,24 @@ def test_files_that_once_gave_warnings_are_read_without_a_word(kind: str, raw: b
         assert len(READERS[kind](raw, "found")) > 0
 
 
+SIGNALLING = struct.pack("<I", 0x7F800001)
+"""A NaN that processors report when they convert it; sensors do write it."""
+
+
+@pytest.mark.parametrize("kind", ["bin", "ply", "pcd"])
+def test_nans_that_signal_are_read_without_a_word_and_come_back_bit_by_bit(kind: str) -> None:
+    heads = {"bin": "", "ply": PLY.replace("N", "2") + "property float q\nend_header\n"}
+    heads["pcd"] = PCD.replace("z\n", "z q\n").replace("4 4\n", "4 4 4\n").replace("F F\n", "F F F\n").replace("1 1\n", "1 1 1\n")
+    raw = heads[kind].replace("N\n", "2\n").encode() + 4 * SIGNALLING + struct.pack("<4f", 1, 2, 3, 4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scan = READERS[kind](raw, "found")
+        out = BytesIO()
+        {"bin": kitti, "ply": ply, "pcd": pcd}[kind].write(scan.moved_to(scan.points + 1), out)
+    assert out.getvalue()[:-16] == raw[:-16]
+    assert np.frombuffer(out.getvalue()[-16:], "<f4").tolist() == [2, 3, 4, 4]
+
+
 def test_a_wild_scale_of_an_extra_dimension_gives_infinities_without_a_word() -> None:
     records = np.array([(7,), (-7,), (0,)], dtype=[("depth", "<i4")])
     with warnings.catch_warnings():
@@ -168,6 +187,11 @@ HOSTILE = {
     "fields.pcd": b"FIELDS" + b" x" * 500_000 + b"\nDATA ascii\n",
     "line.xyz": b"1 2 3 " * 5_000_000, "nine.xyz": b"9" * 30_000_000, "quote.xyz": b'1,2,3,"' + b"," * 20_000_000,
     "columns.csv": b"x,y,z" + b",c" * 400_000 + b"\n" + b"1," * 400_000 + b"1\n", "count.pts": b"4000000000\n1 2 3\n",
+    "grid.pcd": claims(PCD, 1 << 48).replace(b"WIDTH 281474976710656\nHEIGHT 1", b"WIDTH 16777216\nHEIGHT 16777216") + bytes(100),
+    "overflow.pcd": claims(PCD, 4).replace(b"WIDTH 4\nHEIGHT 1", b"WIDTH 4294967296\nHEIGHT 4294967297") + bytes(48),
+    "list.ply": claims(PLY + "property list int float w\nend_header\n", 2) + bytes(12) + b"\xff\xff\xff\x7f" + bytes(40),
+    "zipped.las": gzip.compress(io_samples.las(2, 0)), "zipped.xyz": gzip.compress(b"1 2 3\n" * 100),
+    "unbroken.xyz": b"1 2 3" + b" " * 40_000_000,
     "vlrs.las": io_samples.las(2, 0)[:100] + b"\xff\xff\xff\xff" + io_samples.las(2, 0)[104:],
     "count.las": io_samples.las(2, 0)[:107] + b"\xff\xff\xff\xff" + io_samples.las(2, 0)[111:],
     "count.laz": io_samples.las(2, 0, compressed=True)[:107] + b"\xff\xff\xff\x7f" + io_samples.las(2, 0, compressed=True)[111:],

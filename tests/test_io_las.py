@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import time
 import tracemalloc
 from io import BytesIO
 from typing import Any
@@ -177,6 +178,16 @@ def test_laz_refuses_waveforms_that_lazrs_would_scramble_and_las_holds_them(rng:
         written(scan, compressed=True)
 
 
+@pytest.mark.parametrize("form", [4, 5])
+def test_waveform_packets_are_marked_as_laszip_marks_them(form: int) -> None:
+    """As lazrs marks them, LASzip refuses the file: "WAVEPACKET13 has version > 1"."""
+    raw = io_samples.las(3, form, n_extra=3)
+    packed = written(las.read(raw, "sample"), compressed=True)
+    assert struct.pack("<HHH", 9, 29, 1) in packed
+    assert struct.pack("<HHH", 9, 29, 2) not in packed
+    assert written(las.read(packed, "back"), compressed=False) == raw
+
+
 def test_laz_whose_chunk_table_stands_at_the_end_is_read() -> None:
     raw = io_samples.las(2, 1, compressed=True, n=200)
     start = int(las_file.parse(raw, "sample").field("points_start"))
@@ -223,6 +234,10 @@ DAMAGED = {
     "billions of points": (patched(SMALL, 247, "<Q", 1 << 60), "holds 40"),
     "billions of compressed points": (patched(SMALL_LAZ, 247, "<Q", 1 << 60), "claims"),
     "more compressed points than there are": (patched(OLD_LAZ, 107, "<I", 60_000), "claims 60000 points"),
+    "the largest number of points": (patched(SMALL, 247, "<Q", (1 << 64) - 1), "holds 40"),
+    "the largest number of compressed points": (patched(SMALL_LAZ, 247, "<Q", (1 << 64) - 1), "claims"),
+    "2^63 points": (patched(SMALL, 247, "<Q", 1 << 63), "holds 40"),
+    "EVLRs at the largest number": (patched(patched(SMALL, 235, "<Q", (1 << 64) - 1), 243, "<I", 0xFFFFFFFF), "EVLRs start"),
     "cut in the points": (SMALL[:-7], "holds 39"),
     "cut in the compressed points": (SMALL_LAZ[:700], "compressed points"),
     "cut in the header": (SMALL[:300], "header"),
@@ -263,6 +278,44 @@ def test_chunks_and_layers_that_claim_gigabytes_never_reach_lazrs() -> None:
     hostile = patched(SMALL_LAZ, start + 8 + 30 + 4, "<I", 0xFFFFFFF0)
     with pytest.raises(ScanError, match="layers larger"):
         las.read(hostile, "broken.laz")
+
+
+def test_layers_that_no_chunk_table_accounts_for_never_reach_lazrs() -> None:
+    """Two kilobytes once made lazrs set 1.3 GB aside: the table was moved to where it read as one of no chunks."""
+    start = int(las_file.parse(SMALL_LAZ, "sample").field("points_start"))
+    zeros = SMALL_LAZ + bytes(16)
+    hostile = patched(patched(zeros, start, "<q", len(SMALL_LAZ)), start + 8 + 30 + 4, "<I", 0x4E000000)
+    with pytest.raises(ScanError, match="empty chunk table"):
+        las.read(hostile, "broken.laz")
+
+
+CHUNK_TABLES = {
+    "two billion chunks": lambda raw, table: patched(raw, table + 4, "<I", 1 << 31),
+    "as many chunks as there are bytes": lambda raw, table: patched(raw, table + 4, "<I", len(raw) // 2),
+    "a table past the end": lambda raw, table: patched(raw, points_start(raw), "<q", len(raw) + 1000),
+    "a table at the largest number": lambda raw, table: patched(raw, points_start(raw), "<q", (1 << 63) - 1),
+    "a table before the start": lambda raw, table: patched(raw, points_start(raw), "<q", -5),
+    "a table inside the points": lambda raw, table: patched(raw, points_start(raw), "<q", points_start(raw) + 8),
+}
+
+
+def points_start(raw: bytes) -> int:
+    return int(struct.unpack_from("<I", raw, 96)[0])
+
+
+@pytest.mark.parametrize("raw", [SMALL_LAZ, OLD_LAZ], ids=["layered", "old"])
+@pytest.mark.parametrize("name", CHUNK_TABLES)
+def test_a_false_chunk_table_costs_no_memory_and_gives_the_points_or_one_line(name: str, raw: bytes) -> None:
+    resource = pytest.importorskip("resource")
+    table = struct.unpack_from("<q", raw, points_start(raw))[0]
+    sound = las.read(raw, "sound").points
+    before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
+    try:
+        assert np.array_equal(las.read(CHUNK_TABLES[name](raw, table), "broken.laz").points, sound)
+    except ScanError as fault:
+        assert "\n" not in str(fault)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000, "kilobytes"
+    assert time.process_time() - began < 1
 
 
 def test_a_panic_inside_lazrs_is_a_scan_error_and_an_interrupt_is_not(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,6 +19,7 @@ N = 200
 CASES = [(minor, form, kind) for minor, form in io_samples.LAS_FLAVOURS for kind in ("las", "laz", "copc")]
 CASES = [(minor, form, kind) for minor, form, kind in CASES if kind != "copc" or form in (6, 7, 8)]
 CRS = [io_samples.vlr(b"LASF_Projection", 2112, b'LOCAL_CS["x"]\0'), io_samples.vlr(b"someone", 7, b"\1\2\3")]
+WAVEFORMS = bytes(range(200))
 
 
 def noisy_sheet(point_format: int, n_extra: int) -> np.ndarray:
@@ -31,13 +32,17 @@ def noisy_sheet(point_format: int, n_extra: int) -> np.ndarray:
 
 
 def las_file(minor: int, form: int, kind: str) -> bytes:
-    """A file with described and undescribed extra bytes, VLRs, and from 1.4 on EVLRs; COPC by its VLR, which is what marks it."""
+    """A file with described and undescribed extra bytes, VLRs, from 1.4 on EVLRs, and the waveforms that formats with them may
+    hold; COPC by its VLR, which is what marks it."""
     described = io_samples.vlr(b"LASF_Spec", 4, io_samples.extra_bytes_entry(b"reflectance", 3))
     copc = [io_samples.vlr(b"copc", 1, bytes(160))] if kind == "copc" else []
-    evlrs = [io_samples.evlr(b"someone", 9, b"late")] if minor == 4 else []
+    evlrs = [io_samples.evlr(b"someone", 9, b"late"), io_samples.evlr(b"someone", 9, b"later")] if minor == 4 else []
+    has_waveforms = form in (4, 5, 9, 10)
+    packets = [io_samples.vlr(b"LASF_Spec", 100, bytes(26))] if has_waveforms else []
     return io_samples.las(
-        minor, form, compressed=kind != "las", vlrs=[*copc, *CRS, described], evlrs=evlrs, records=noisy_sheet(form, 3)
-    )
+        minor, form, compressed=kind != "las", vlrs=[*copc, *CRS, *packets, described], evlrs=evlrs,
+        waveforms=WAVEFORMS if has_waveforms else b"", records=noisy_sheet(form, 3),
+    )  # fmt: skip
 
 
 def read_by_laspy(path: Path) -> laspy.LasData:
@@ -46,7 +51,7 @@ def read_by_laspy(path: Path) -> laspy.LasData:
 
 
 @pytest.mark.parametrize(("minor", "form", "kind"), CASES)
-def test_laspy_reads_every_dimension_vlr_and_evlr_of_a_cleaned_file_as_before(
+def test_laspy_reads_every_dimension_vlr_evlr_and_waveform_of_a_cleaned_file_as_before(
     minor: int, form: int, kind: str, tmp_path: Path
 ) -> None:
     suffix = "las" if kind == "las" else "laz"
@@ -69,6 +74,8 @@ def test_laspy_reads_every_dimension_vlr_and_evlr_of_a_cleaned_file_as_before(
     ]
     assert found == kept
     assert [v.record_data_bytes() for v in after.evlrs or []] == [v.record_data_bytes() for v in before.evlrs or []]
+    if form in (4, 5, 9, 10):
+        assert out.read_bytes()[after.header.start_of_waveform_data_packet_record :].startswith(WAVEFORMS)
     assert np.allclose(after.header.maxs, np.asarray(after.xyz).max(axis=0))
     assert np.allclose(after.header.mins, np.asarray(after.xyz).min(axis=0))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import pickle
 import re
 import struct
@@ -200,6 +201,24 @@ def test_files_larger_than_any_model_are_not_even_read(folder: Path) -> None:
         (folder / name).write_bytes(whole)
 
 
+def test_a_config_that_would_fill_memory_once_it_is_parsed_is_not_parsed(folder: Path) -> None:
+    (folder / store.CONFIG).write_bytes(b"[" + b"[]," * (8 << 20) + b"0]")  # 24 MB of text, 500 MB of lists
+    refused(folder, "larger than any model")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs devices and pipes")
+@pytest.mark.parametrize("name", [store.WEIGHTS, store.CONFIG])
+def test_links_to_devices_pipes_and_themselves_are_refused_at_once(folder: Path, name: str) -> None:
+    path = folder / name
+    path.unlink()
+    for place in (Path("/dev/zero"), path, folder / "pipe"):
+        if place.name == "pipe":
+            os.mkfifo(place)
+        path.symlink_to(place)
+        refused(folder)
+        path.unlink()
+
+
 def test_a_header_that_promises_more_than_there_is_is_refused(folder: Path) -> None:
     for length in (2**63, 2**40, 10**7):
         (folder / store.WEIGHTS).write_bytes(struct.pack("<Q", length) + b"{}")
@@ -229,7 +248,19 @@ def test_weights_that_are_not_numbers_are_refused(folder: Path, value: float) ->
     refused(folder, "not all numbers")
 
 
-def test_weights_of_another_shape_type_or_name_are_refused(folder: Path) -> None:
+@pytest.mark.parametrize(
+    "kind_of_number", [torch.float64, torch.float16, torch.bfloat16, torch.int32, torch.bool, torch.float8_e4m3fn]
+)
+def test_weights_of_another_type_are_refused_not_converted(folder: Path, kind_of_number: torch.dtype) -> None:
+    """1e300 is a number in float64 and none in the network's float32."""
+    sound = tensors(folder)
+    name = next(name for name, tensor in sound.items() if tensor.dtype == torch.float32)
+    other = torch.full_like(sound[name], 1e300 if kind_of_number == torch.float64 else 1, dtype=kind_of_number)
+    write_tensors(folder, {**sound, name: other})
+    refused(folder, "is torch.*, not torch.float32")
+
+
+def test_weights_of_another_shape_or_name_are_refused(folder: Path) -> None:
     sound = tensors(folder)
     name = next(iter(sound))
     for content in (
@@ -255,7 +286,7 @@ CONFIG_CHANGES: dict[str, Callable[[dict[str, Any]], object]] = {
     "settings of another kind": lambda c: c.update(settings=[1, 2]),
     "too many channels": lambda c: c["settings"].update(channels=10**9),
     "negative channels": lambda c: c["settings"].update(channels=-1),
-    "too many neighbours": lambda c: c["settings"].update(neighbours=10**6),
+    "too many neighbours": lambda c: c["settings"].update(neighbours=10**9),
     "too many rounds": lambda c: c["settings"].update(rounds=[10**9]),
     "no round": lambda c: c["settings"].update(rounds=[0]),
     "negative rounds": lambda c: c["settings"].update(rounds=[-1]),

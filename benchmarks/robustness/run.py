@@ -33,6 +33,7 @@ import pcdenoise.denoising.denoiser
 import pcdenoise.evaluation.report
 import pcdenoise.networks.store  # noqa: F401
 from pcdenoise import commands, io
+from pcdenoise.cloud.scan import Scan
 from pcdenoise.errors import ScanError
 
 COMMAND = [sys.executable, "-m", "pcdenoise"]
@@ -51,6 +52,7 @@ class Tally:
     counts: Counter[str] = field(default_factory=Counter)
     formats: Counter[str] = field(default_factory=Counter)
     refused: dict[str, str] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
     largest_mb: float = 0.0
     slowest_s: float = 0.0
@@ -90,25 +92,25 @@ def run(
     limit_s: float,
     *,
     stdout: Any = None,
-    kill_after_s: float = 0,
-    number: int = 0,
+    disturb: Callable[[int], object] | None = None,
+    after_s: float = 0,
     file_size: int = 0,
     room: int = 0,
 ) -> Done:
-    """The command line in a process of its own, with a time limit, on request with a signal or limits of file sizes and memory.
+    """The command line in a process of its own, with a time limit, on request disturbed or with limits of file sizes and memory.
 
-    A process that gets a signal starts from nothing, so that imports are hit too; the others are forks of this one, which has
-    loaded the libraries already.
+    disturb: is called with the process' number after so many seconds. Such a process starts from nothing, so that imports are hit
+    too; the others are forks of this one, which has loaded the libraries already.
     """
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as errors:
-        started, hung, sent = time.monotonic(), False, not number
+        started, hung, disturbed = time.monotonic(), False, disturb is None
         target = out if stdout is None else stdout
-        pid = _started(arguments, target, errors) if number else _forked(arguments, target, errors, file_size, room)
+        pid = _started(arguments, target, errors) if disturb else _forked(arguments, target, errors, file_size, room)
         while not (ended := os.wait4(pid, os.WNOHANG))[0]:
             elapsed = time.monotonic() - started
-            if not sent and elapsed > kill_after_s:
-                os.kill(pid, number)
-                sent = True
+            if disturb and not disturbed and elapsed > after_s:
+                disturb(pid)
+                disturbed = True
             if elapsed > limit_s and not hung:
                 os.kill(pid, signal.SIGKILL)
                 hung = True
@@ -172,6 +174,7 @@ def through_all_commands(path: Path, folder: Path, tally: Tally) -> None:
             is_refused = done.code == 3
             n_points = 0 if done.code else json.loads(done.stdout)[0]["points"]
             tally.formats["refused" if is_refused else io.SUFFIXES[path.suffix.lower()]] += 1
+        tally.seconds[title] = round(done.seconds, 2)
         limit_s = TIME_LIMIT_S + TIME_PER_MILLION_POINTS_S * n_points / 1e6
         most = MEMORY_FLOOR + MEMORY_PER_BYTE * path.stat().st_size + MEMORY_PER_POINT * n_points
         tally.check(title, done.seconds <= limit_s, f"took {done.seconds:.1f} CPU s")
@@ -243,13 +246,13 @@ def signals(scan: Path, folder: Path, n: int, rng: random.Random, tally: Tally) 
     target = folder / f"out{scan.suffix}"
     arguments = ["denoise", str(scan), "-o", str(target), "--overwrite", *FAST]
     began = time.monotonic()
-    run(arguments, 300, number=signal.SIGTERM, kill_after_s=float("inf"))
+    run(arguments, 300, disturb=signal_of(signal.SIGTERM), after_s=float("inf"))
     new, wall_s = target.read_bytes(), time.monotonic() - began
     for i in range(n):
         number = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL, signal.SIGHUP)[i % 4]
         target.write_bytes(b"old")
         moment = rng.uniform(0.05, 1.2 * wall_s)
-        done = run(arguments, 120, kill_after_s=moment, number=number)
+        done = run(arguments, 120, disturb=signal_of(number), after_s=moment)
         tally.counts["signals"] += 1
         name = f"{number.name} after {moment:.2f} s"
         tally.judge(name, done, {0, -number, 128 + number})
@@ -265,6 +268,86 @@ def signals(scan: Path, folder: Path, n: int, rng: random.Random, tally: Tally) 
     run(arguments, 120)
     tally.check("a run after all signals", [path.name for path in folder.iterdir()] == [target.name], "leftovers stay")
     target.unlink()
+
+
+def signal_of(number: int) -> Callable[[int], object]:
+    """Sends a process that signal."""
+    return lambda pid: os.kill(pid, number)
+
+
+def kill_a_worker(pid: int) -> None:
+    """SIGKILL to the youngest child of a process, which is one of its workers if it has any."""
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    if children:
+        os.kill(int(children[-1]), signal.SIGKILL)
+
+
+def in_cells(folder: Path, n_signals: int, rng: random.Random, tally: Tally) -> None:
+    """The same for scans in cells and in workers: after every fault the next run, with --resume, gives the undisturbed bytes."""
+    source, target = folder / "in", folder / "out"
+    generator = np.random.default_rng(0)
+    source.mkdir()
+    for k, suffix in enumerate(("las", "laz", "ply", "xyz")):
+        x, y = generator.random((2, 5000 + 500 * k))
+        points = np.column_stack([x, y, 0.1 * np.sin(6 * x) + generator.normal(0, 0.005, len(x))]).round(5)
+        io.write(Scan(points), source / f"{suffix}.{suffix}")
+    raw = {path.name: path.read_bytes() for path in source.iterdir()}
+    arguments = ["denoise", str(source), "-o", f"{target}/", "--tile", "1000", *FAST]
+    began = time.monotonic()
+    done = run(arguments, 300, disturb=signal_of(signal.SIGTERM), after_s=float("inf"))
+    wall_s = time.monotonic() - began
+    tally.judge("in cells", done, {0})
+    expected = {path.name: path.read_bytes() for path in target.iterdir()}
+
+    def disturbed(name: str, codes: set[int], *more: str, **how: Any) -> None:
+        shutil.rmtree(target)
+        target.mkdir()
+        done = run([*arguments, *more], 120, **how)
+        if done.code == 1:  # a batch goes on, with a line for each input that failed and one at the end
+            tally.check(name, len(done.stderr.splitlines()) <= len(raw) + 1, f"said {done.stderr[-300:]}")
+        tally.judge(name, done, codes)
+        for path in target.iterdir():
+            is_part = path.name.startswith(".") and path.name.endswith((".cells", ".part"))
+            tally.check(name, is_part or path.read_bytes() == expected[path.name], f"{path.name} is neither whole nor absent")
+        for name_, content in raw.items():
+            (source / name_).write_bytes(content)
+        for part in target.glob(".*.part"):  # what SIGKILL left: old enough for the next run
+            os.utime(part, (0, 0))
+        again = run([*arguments, "--resume"], 120)
+        tally.judge(f"resume after {name}", again, {0})
+        found = {path.name: path.read_bytes() for path in target.iterdir() if path.is_file()}
+        tally.check(f"resume after {name}", found == expected, "gave other bytes")
+        tally.check(f"resume after {name}", {path.name for path in target.iterdir()} == set(expected), "something is left")
+
+    for size in (10_000, 40_000, 100_000):
+        tally.counts["faults injected"] += 1
+        disturbed(f"cells of at most {size} bytes", {0, 1}, file_size=size)
+    for megabytes in (1, 4, 16):
+        tally.counts["faults injected"] += 1
+        # lazrs, in Rust, ends the process where memory is out
+        disturbed(f"{megabytes} MB of memory for cells", {0, 1, -signal.SIGABRT}, room=megabytes << 20)
+
+    def cut(pid: int) -> None:
+        for path in source.iterdir():
+            if path.suffix != ".xyz":  # half a text is a text
+                os.truncate(path, path.stat().st_size // 2)
+
+    for _ in range(4):
+        tally.counts["faults injected"] += 1
+        moment = rng.uniform(0.3, 0.9) * wall_s
+        disturbed(f"inputs cut after {moment:.2f} s", {0, 1}, disturb=cut, after_s=moment)
+    for _ in range(4):
+        tally.counts["faults injected"] += 1
+        moment = rng.uniform(0.3, 0.9) * wall_s
+        more = ("--workers", "2", "--threads", "1")
+        disturbed(f"a worker killed after {moment:.2f} s", {0}, *more, disturb=kill_a_worker, after_s=moment)
+    for k in range(n_signals):
+        tally.counts["signals"] += 1
+        number = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL, signal.SIGHUP)[k % 4]
+        more = ("--workers", "2") if k % 8 >= 4 and number != signal.SIGKILL else ()
+        moment = rng.uniform(0.3, 1.0) * wall_s
+        name = f"{number.name} after {moment:.2f} s in cells"
+        disturbed(name, {0, -number, 128 + number}, *more, disturb=signal_of(number), after_s=moment)
 
 
 def mutated(raw: bytes, rng: random.Random) -> bytes:
@@ -347,6 +430,7 @@ def main() -> int:
 
     def stage(work: Callable[[Path], None]) -> None:
         folder = Path(tempfile.mkdtemp())
+        print(f"{time.strftime('%H:%M:%S')}  {len(tally.faults)} faults so far", file=sys.stderr, flush=True)
         try:
             work(folder)
         finally:
@@ -355,6 +439,7 @@ def main() -> int:
     stage(lambda folder: faults(sample, folder, tally))
     stage(lambda folder: [through_all_commands(path, folder, tally) for path in paths] and None)
     stage(lambda folder: signals(sample, folder, options.kills, rng, tally))
+    stage(lambda folder: in_cells(folder, -(-options.kills // 2), rng, tally))
     fuzz(paths, options.minutes, rng, tally)
     n_mutated, n_refused = tally.counts["mutated files"], tally.counts["mutated files refused"]
     print(f"files tried      {tally.counts['files']}, {len(tally.refused)} of them refused in one line")
@@ -362,6 +447,8 @@ def main() -> int:
     print(f"faults injected  {tally.counts['faults injected']}")
     print(f"signals          {tally.counts['signals']}")
     print(f"fuzz minutes     {options.minutes:g}: {n_mutated} files, {n_refused} refused")
+    slowest = sorted(tally.seconds.items(), key=lambda pair: -pair[1])[:5]
+    print(f"slowest          {', '.join(f'{name} {seconds:.1f} CPU s' for name, seconds in slowest)}")
     print(f"most             {tally.slowest_s:.1f} CPU s, {tally.largest_mb:.0f} MB")
     print("\n".join(tally.faults) or "nothing lost, hung or crashed")
     if options.json:

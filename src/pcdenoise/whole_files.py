@@ -38,19 +38,27 @@ def replaced(target: Path) -> Iterator[BinaryIO]:
         raise
 
 
+def tidy(target: Path) -> None:
+    """Removes what a writer of this target left that is known to have been killed; nothing if another one is at work."""
+    _removed_if_abandoned(target.with_name(f".{_stem(target)}.part"), 0)
+
+
 def _part_of(target: Path) -> Path:
     """The hidden file to write to: one name, which a killed run's leftover makes room for, or a random one while it is in use."""
-    stem = target.name.encode("utf-8", "surrogateescape")[:_LONGEST_STEM].decode("utf-8", "ignore")
-    part = target.with_name(f".{stem}.part")
-    if os.path.lexists(part) and not _removed_if_abandoned(part):
-        return target.with_name(f".{stem}.{secrets.token_hex(4)}.part")
+    part = target.with_name(f".{_stem(target)}.part")
+    if os.path.lexists(part) and not _removed_if_abandoned(part, _YOUNG_S):
+        return target.with_name(f".{_stem(target)}.{secrets.token_hex(4)}.part")
     return part
 
 
-def _removed_if_abandoned(part: Path) -> bool:
-    """Removes a file that nobody has open and nobody has written to for a minute; whether it did."""
+def _stem(target: Path) -> str:
+    return target.name.encode("utf-8", "surrogateescape")[:_LONGEST_STEM].decode("utf-8", "ignore")
+
+
+def _removed_if_abandoned(part: Path, young_s: float) -> bool:
+    """Removes a file that nobody has open and nobody has written to for so long; whether it did."""
     try:
-        if time.time() - part.stat().st_mtime < _YOUNG_S:
+        if time.time() - part.stat().st_mtime < young_s:
             return False
         with part.open("rb+") as file:
             _mark_in_use(file)

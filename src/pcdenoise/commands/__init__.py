@@ -100,6 +100,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 return _without_reader()
             raise
         except Exception as fault:
+            if isinstance(fault.__cause__, KeyboardInterrupt):  # Python 3.11 wraps what comes while a class is being made
+                return _fail("interrupted; nothing is half-written", INTERRUPTED)
+            if isinstance(fault.__cause__, SystemExit):
+                raise fault.__cause__ from None
             known = of_the_system(fault)
             if known is None:
                 raise

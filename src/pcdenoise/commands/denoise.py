@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import shutil
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from pcdenoise import __version__
 from pcdenoise.commands import files, options, outputs, selection
 from pcdenoise.commands import workers as workers_
 from pcdenoise.commands.batch import Batch, Figures
@@ -19,7 +21,7 @@ from pcdenoise.commands.memory import n_bytes
 from pcdenoise.commands.options import configured, option
 from pcdenoise.commands.undo import with_colours, with_displacement, with_uncertainty
 from pcdenoise.commands.verify import MaxDrift, check_drift
-from pcdenoise.errors import UsageError
+from pcdenoise.errors import ScanError, UsageError
 
 if TYPE_CHECKING:
     from pcdenoise.cloud.scan import Scan
@@ -180,6 +182,16 @@ def _cells_of(job: Job) -> Path:
     return job.target.with_name(f".{job.target.name}.cells")
 
 
+def _check_unchanged(source: Path, before: os.stat_result) -> None:
+    """Raises ScanError if somebody wrote into a file that is read several times; one replaced or removed is still read."""
+    try:
+        now = source.stat()
+    except OSError:
+        return
+    if now.st_ino == before.st_ino and (now.st_size, now.st_mtime_ns) != (before.st_size, before.st_mtime_ns):
+        raise ScanError(f"{source}: changed while it was cleaned; run again once it is complete")
+
+
 @dataclass(frozen=True)
 class _Cleaning:
     """What is the same for every scan of a run: how to clean, what to write, and pages of the last scan for its report.
@@ -247,15 +259,21 @@ class _Cleaning:
         job.target.parent.mkdir(parents=True, exist_ok=True)
         folder = _cells_of(job)
         about = job.source.stat()
+
+        def read() -> Iterator[Scan]:
+            for piece in stream.pieces(_PIECE_ROWS):
+                _check_unchanged(job.source, about)
+                yield piece
+
         tiles = Tiles(
-            folder, lambda: (piece.points for piece in stream.pieces(_PIECE_ROWS)), self.model, self.config, cell_points,
-            {"source": str(job.source.resolve()), "size": about.st_size, "changed": about.st_mtime_ns},
+            folder, lambda: (piece.points for piece in read()), self.model, self.config, cell_points,
+            {"source": str(job.source.resolve()), "size": about.st_size, "changed": about.st_mtime_ns, "version": __version__},
         )  # fmt: skip
         self.console.detail(f"{job.source}: {stream.n_points:,} points in cells of {cell_points:,}, kept in {folder}")
         with self.console.progress(job.source.name) as on_progress:
             tiles.run(on_progress)
             check_drift(job.target, tiles.figures["drift"], tiles.figures["noise"], self.max_drift)
-            pieces = (self._piece(scan, rows) for scan, rows in zip(stream.pieces(_PIECE_ROWS), tiles.rows(), strict=True))
+            pieces = (self._piece(scan, rows) for scan, rows in zip(read(), tiles.rows(), strict=True))
             io.write_streamed(
                 stream, pieces, job.target, format=format_of(job.target, self.format), overwrite=self.overwrite,
                 provenance=outputs.provenance("denoise", self.settings),

@@ -14,6 +14,7 @@ from typing import Any
 from pcdenoise.commands.files import Job
 from pcdenoise.commands.workers import Engine, Outcome, Work, far_outcome
 from pcdenoise.errors import ScanError
+from pcdenoise.whole_files import tidy
 
 
 def in_processes(n_workers: int) -> Engine:
@@ -41,6 +42,7 @@ def in_processes(n_workers: int) -> Engine:
                             yield future.result()
                 suspects += running.values()
             for job in suspects:
+                tidy(job.target)
                 yield _alone(job, work)
 
     return run
@@ -51,6 +53,7 @@ def _alone(job: Job, work: Work) -> Outcome:
         with _pool(1) as pool:
             return pool.submit(far_outcome, work, job).result()
     except BrokenProcessPool:
+        tidy(job.target)
         fault = f"{job.source}: its worker was killed twice; it may need more memory: give fewer --workers or less --max-memory"
         return Outcome(job, error=ScanError(fault))
 

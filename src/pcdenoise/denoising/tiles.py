@@ -132,10 +132,8 @@ class Tiles:
     def plan(self) -> dict[str, Any]:
         """Counts, origin, cuts and probes; cells are made on the disk if they are not there."""
         path = self.folder / "plan.json"
-        if path.is_file():
-            plan: dict[str, Any] = json.loads(path.read_text())
-            if plan["job"] == json.loads(json.dumps(self.job)) and plan["cell_points"] <= _LARGER_CELLS * self.cell_points:
-                return plan
+        if path.is_file() and (old := self._followable(path.read_bytes())):
+            return old
         shutil.rmtree(self.folder, ignore_errors=True)
         (self.folder / "start").mkdir(parents=True)
         central, probed = _Smallest(denoiser.N_CENTRAL), _Smallest(N_PROBES)
@@ -151,7 +149,7 @@ class Tiles:
             low, high = np.minimum(low, usable.min(axis=0, initial=np.inf)), np.maximum(high, usable.max(axis=0, initial=-np.inf))
         origin = denoiser.origin_of(central.points)
         cuts = _cuts(central.points - origin, max(1, -(-n_finite // self.cell_points)))
-        plan = {
+        plan: dict[str, Any] = {
             "job": self.job,
             "cell_points": self.cell_points,
             "n_rows": n_rows,
@@ -171,6 +169,15 @@ class Tiles:
         plan["n_distinct"] = sum(self._sort(cell) for cell in range(plan["n_cells"]))
         _write(path, json.dumps(plan).encode())
         return plan
+
+    def _followable(self, said: bytes) -> dict[str, Any] | None:
+        """The plan that a file holds, if it is one of this job and of cells that fit in memory now."""
+        try:
+            plan: dict[str, Any] = json.loads(said)
+            same = plan["job"] == json.loads(json.dumps(self.job)) and plan["cell_points"] <= _LARGER_CELLS * self.cell_points
+        except (ValueError, KeyError, TypeError):
+            return None
+        return plan if same else None
 
     @property
     def cells(self) -> range:
@@ -478,7 +485,10 @@ def _write(path: Path, data: bytes) -> None:
     """A file that is there whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".part")
-    part.write_bytes(data)
+    with part.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())  # so that after a power cut, too, a file that is there is whole
     os.replace(part, path)
 
 

@@ -76,7 +76,15 @@ def mapped(path: str | os.PathLike[str]) -> Iterator[mmap.mmap]:
             raw = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except OSError as fault:
         raise ScanError(f"{path}: cannot be read ({fault.strerror}); check its permissions and the disk") from None
+    except ValueError:  # emptied since somebody looked at its size
+        raise ScanError(f"{path}: is empty; check what wrote it") from None
     yield raw  # closed with its last view: numpy may hold some for a while
+
+
+def check_not_cut(raw: Raw, origin: str) -> None:
+    """Raises ScanError if a mapped file has become shorter: the system ends a process that looks at a byte that has gone."""
+    if isinstance(raw, mmap.mmap) and raw.size() < len(raw):
+        raise ScanError(f"{origin}: was cut to {raw.size()} bytes while it was read; run again once it is complete")
 
 
 def let_go(raw: Raw) -> None:

@@ -26,7 +26,8 @@ class KittiSource:
 
     def points(self) -> Points:
         """(N, 3) coordinates as stored."""
-        return self.values[:, :3].astype(np.float64)
+        with np.errstate(invalid="ignore"):  # a NaN may be a signalling one
+            return self.values[:, :3].astype(np.float64)
 
     def attachments(self) -> list[str]:
         """Nothing."""
@@ -68,9 +69,10 @@ def coarser(points: Points) -> list[str]:
 def write(scan: Scan, file: BinaryIO) -> None:
     """Write a scan as KITTI values; intensity is 0 if the scan has none."""
     values = np.zeros((len(scan), _N_VALUES), "<f4")
+    before = np.zeros((len(scan), 3))
     if isinstance(scan.source, KittiSource):
         values[:] = scan.source.values
-    before = values[:, :3].astype(np.float64)
+        before = scan.source.points()
     for i in range(3):
         rows = moved_rows(before[:, i], scan.points[:, i])
         values[rows, i] = encoded(scan.points[rows, i], values.dtype, "xyz"[i])

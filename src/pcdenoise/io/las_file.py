@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pcdenoise.errors import ScanError
 from pcdenoise.io import laz
-from pcdenoise.io.files import Raw, let_go
+from pcdenoise.io.files import Raw, check_not_cut, let_go
 
 HEADER = np.dtype(
     [
@@ -182,8 +182,9 @@ class Body:
             return
         for first in range(0, self.n_points, n_rows):
             n = min(n_rows, self.n_points - first)
+            check_not_cut(self.raw, self.origin)
             octets = np.frombuffer(self.raw, np.uint8, n * self.length, self.start + first * self.length)
-            yield octets.reshape(n, self.length)
+            yield (octets if isinstance(self.raw, bytes) else octets.copy()).reshape(n, self.length)
             let_go(self.raw)
 
 

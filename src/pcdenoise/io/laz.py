@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdenoise.errors import ScanError
-from pcdenoise.io.files import Raw
+from pcdenoise.io.files import Raw, check_not_cut
 
 _ITEMS = 32  # where a layout counts its items
 _LAYERED = 3
+_WAVEFORM_PACKET = b"\x09\x00"  # the item of formats 4 and 5; 9 and 10 have another
 _N_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # by item: point, RGB, RGB and NIR, waveform packet; extra bytes have one a byte
 _LARGEST_CHUNK = 64 << 20
 _LARGEST_RATIO = 5_000  # points all alike compress 3000 to 1 in chunks of 50000
@@ -35,19 +36,19 @@ def decompressed(
     """
     if n_points == 0:
         return
+    check_not_cut(raw, origin)
     try:
         item_length = lazrs.LazVlr(layout).item_size()
         if item_length != length:
             raise ScanError(f"{origin}: {length} bytes a point, {item_length} in the laszip VLR; the file is damaged")
-        chunks = _chunk_table(raw, start, layout)
+        chunks = _chunk_table(raw, start, layout, origin)
         most = _LARGEST_RATIO * (len(raw) - start) // length
         held = min(most, sum(n for n, _ in chunks)) if chunks else most
         if n_points > held:
             raise ScanError(
                 f"{origin}: header claims {n_points} points, the compressed data holds at most {held}; fetch it again"
             )
-        source = BytesIO(raw) if isinstance(raw, bytes) else _MappedFile(raw)
-        source.seek(start)
+        source = _as_file(raw, start, origin)
         in_parallel = chunks and max(n for n, _ in chunks) * length <= _LARGEST_CHUNK  # lazrs makes room for whole chunks
         decompressor = (lazrs.ParLasZipDecompressor if in_parallel else lazrs.LasZipDecompressor)(source, layout)
         for first in range(0, n_points, n_rows):
@@ -67,8 +68,8 @@ def decompressed(
 class _MappedFile(RawIOBase):
     """A mapped file as a stream of its own place, since several may read it at once."""
 
-    def __init__(self, raw: mmap) -> None:
-        self.raw, self.at = raw, 0
+    def __init__(self, raw: mmap, origin: str) -> None:
+        self.raw, self.origin, self.at = raw, origin, 0
 
     def readable(self) -> bool:
         return True
@@ -84,13 +85,21 @@ class _MappedFile(RawIOBase):
         return self.at
 
     def readinto(self, buffer: Any) -> int:
+        check_not_cut(self.raw, self.origin)
         piece = self.raw[self.at : self.at + len(buffer)]
         buffer[: len(piece)] = piece
         self.at += len(piece)
         return len(piece)
 
 
-def _chunk_table(raw: Raw, start: int, layout: bytes) -> list[tuple[int, int]]:
+def _as_file(raw: Raw, at: int, origin: str) -> BytesIO | _MappedFile:
+    """A file of these bytes that stands at byte `at`, without a copy of them."""
+    source = BytesIO(raw) if isinstance(raw, bytes) else _MappedFile(raw, origin)
+    source.seek(at)
+    return source
+
+
+def _chunk_table(raw: Raw, start: int, layout: bytes, origin: str) -> list[tuple[int, int]]:
     """(points, bytes) of each compressed chunk; empty if the stream has no table. Raises LazrsError on sizes that cannot be true.
 
     Checked here because lazrs allocates what the file says, and an allocation that fails ends the process.
@@ -106,12 +115,12 @@ def _chunk_table(raw: Raw, start: int, layout: bytes) -> list[tuple[int, int]]:
     (n_chunks,) = struct.unpack_from("<I", raw, table + 4)
     if n_chunks > table - start:
         raise lazrs.LazrsError(f"a table of {n_chunks} chunks")
-    source = BytesIO(raw)
-    source.seek(start)
-    chunks: list[tuple[int, int]] = lazrs.read_chunk_table(source, lazrs.LazVlr(layout))
+    chunks: list[tuple[int, int]] = lazrs.read_chunk_table(_as_file(raw, start, origin), lazrs.LazVlr(layout))
     if sum(size for _, size in chunks) > table - start - 8:
         raise lazrs.LazrsError("chunks larger than the file")
     if compressor == _LAYERED:
+        if not chunks:  # lazrs would read on past the table, into layers that nothing has checked
+            raise lazrs.LazrsError("an empty chunk table")
         _check_layers(raw, start + 8, chunks, layout)
     return chunks
 
@@ -130,12 +139,21 @@ def _check_layers(raw: Raw, at: int, chunks: list[tuple[int, int]], layout: byte
 
 def layout(point_format: int, n_extra: int, present: Sequence[bytes]) -> bytes:
     """How to compress points of a format with extra bytes: as one of the layouts present if lazrs can, else lazrs' default."""
-    default: bytes = lazrs.LazVlr.new_for_compression(point_format, n_extra).record_data()
+    default = _for_laszip(lazrs.LazVlr.new_for_compression(point_format, n_extra).record_data())
     for own in present:
         same_kind = own[:2] == default[:2] and own[_ITEMS:] == default[_ITEMS:]
         if same_kind and 0 < struct.unpack_from("<I", own, 12)[0] * lazrs.LazVlr(own).item_size() <= _LARGEST_CHUNK:
             return own
     return default
+
+
+def _for_laszip(layout: bytes) -> bytes:
+    """A layout of lazrs 0.8 as LASzip reads it: lazrs calls its way to compress waveform packets the second, LASzip the first."""
+    octets = bytearray(layout)
+    for at in range(_ITEMS + 2, len(octets), 6):
+        if octets[at : at + 2] == _WAVEFORM_PACKET:
+            octets[at + 4 : at + 6] = b"\1\0"
+    return bytes(octets)
 
 
 def compress(parts: Iterable[NDArray[np.uint8]], layout: bytes, file: BinaryIO, *, check: bool) -> None:

@@ -16,7 +16,7 @@ from plyfile import PlyData, PlyElement
 from pcdenoise.cloud.scan import Mask, Points, Scan
 from pcdenoise.errors import ScanError
 from pcdenoise.io import ply_header
-from pcdenoise.io.files import Raw, let_go
+from pcdenoise.io.files import Raw, check_not_cut, let_go
 from pcdenoise.io.lines import find_lines, first_visible
 from pcdenoise.io.ply_header import TYPES, Element, Header
 from pcdenoise.io.records import FixedRecords, ListRecords, Records, TextRecords
@@ -118,6 +118,7 @@ class PlyStream:
         """Scans of at most n_rows rows, in order."""
         names = [name for name in self.records.array.dtype.names or () if name not in self.axes]
         for first in range(0, self.n_points, n_rows):
+            check_not_cut(self.raw, self.origin)
             records = FixedRecords(self.records.array[first : first + n_rows].copy(), self.axes)
             columns = {name: _native(records.column(name)) for name in names}
             source = replace(self.source, records=records, columns=columns)

@@ -11,7 +11,7 @@ import numpy as np
 
 from pcdenoise.cloud.scan import Mask, Points, Scan
 from pcdenoise.errors import ScanError
-from pcdenoise.io.files import Raw, let_go
+from pcdenoise.io.files import Raw, check_not_cut, let_go
 from pcdenoise.io.lines import Octets, Offsets, find_lines, first_visible, is_number, split_fields
 from pcdenoise.io.source import Column, changed, colours_as_bytes, exactly, moved_rows, portable, step_decimals
 from pcdenoise.io.source import is_number as holds_numbers
@@ -161,6 +161,7 @@ class XyzStream:
         """Scans of about n_rows rows, in order. Raises ScanError naming the first line that lacks a coordinate."""
         at, line, n_points = self.body_start, self.layout.first_row + 1, 0
         while at < len(self.raw):
+            check_not_cut(self.raw, self.origin)
             last = min(at + n_rows * self._row_bytes, len(self.raw)) - 1
             stop = (self.raw.find(b"\n", last) + 1) or len(self.raw)
             rows = _rows(np.frombuffer(self.raw[at:stop], np.uint8), self.layout, self.origin, line)

@@ -28,7 +28,7 @@ Network: TypeAlias = "ProjectionNetwork | MCConvNetwork"
 
 WEIGHTS, CONFIG, CARD = "weights.safetensors", "config.json", "README.md"
 DEFAULT = "default"
-_LARGEST_FILE = 64 * 2**20
+_LARGEST_FILE = {WEIGHTS: 64 << 20, CONFIG: 1 << 20}  # bytes; JSON takes up to thirty times its size in memory
 
 
 class _Settings(BaseModel):
@@ -121,6 +121,10 @@ def load(name_or_folder: str | Path = DEFAULT) -> Model:
         tensors = parse(data)
     except (SafetensorError, ValueError, KeyError) as fault:
         raise ModelError(f"{path}: not a safetensors file ({in_one_line(fault)}); copy the model folder again") from None
+    types = {name: tensor.dtype for name, tensor in network.state_dict().items()}
+    for name, tensor in tensors.items():
+        if tensor.dtype != types.get(name, tensor.dtype):  # a conversion could make infinities of numbers
+            raise ModelError(f"{path}: {name} is {tensor.dtype}, not {types[name]}; copy the model folder again")
     try:
         network.load_state_dict(tensors)
     except RuntimeError as fault:
@@ -164,7 +168,9 @@ def _find(name_or_folder: str | Path) -> Path:
 
 def _read(path: Path) -> bytes:
     try:
-        if path.stat().st_size > _LARGEST_FILE:
+        if path.exists() and not path.is_file():
+            raise ModelError(f"{path}: is no regular file; copy the model folder again")
+        if path.stat().st_size > _LARGEST_FILE[path.name]:
             raise ModelError(f"{path}: larger than any model of this program; copy the model folder again")
         return path.read_bytes()
     except OSError as fault:
