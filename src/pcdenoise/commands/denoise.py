@@ -276,7 +276,7 @@ class _Cleaning:
 
     def _clean_whole(self, job: Job) -> Figures:
         from pcdenoise import io
-        from pcdenoise.commands.survey import traps
+        from pcdenoise.commands.survey import traps, unit_of
         from pcdenoise.denoising import denoiser
         from pcdenoise.denoising.part import denoise_part
         from pcdenoise.evaluation.report import Page
@@ -299,7 +299,10 @@ class _Cleaning:
         )  # fmt: skip
         figures = {"points": len(scan), **result.figures, "seconds": round(time.perf_counter() - started, 3)}
         if picture := self.pictures.get(job.source):
-            outputs.save_before_after(picture, scan, result.points, notes=_notes(result), overwrite=self.overwrite)
+            unit = unit_of(scan)
+            outputs.save_before_after(
+                picture, scan, result.points, notes=_notes(result, unit), unit=unit, overwrite=self.overwrite
+            )
         self.pages[:] = [Page(scan.points, result.points, colours=outputs.colours(scan))]
         for text in traps(scan, figures["noise"] if figures["is_surface"] else None):
             self.console.note(f"{job.source}: {text}")
@@ -322,12 +325,12 @@ class _Cleaning:
         return io.select(cleaned, ~result.outlier) if self.config.outliers == "remove" else cleaned
 
 
-def _notes(result: Result) -> tuple[str, str]:
-    """The roughness before the first pass and after the last, for a picture."""
+def _notes(result: Result, unit: str) -> tuple[str, str]:
+    """What a picture says under its titles: how far points were off, and how far they moved."""
     if not result.steps:
-        return "", "nothing moved"
-    before, after = result.steps[0].figures["roughness_before"], result.steps[-1].figures["roughness_after"]
-    return f"roughness {figure(before)}", f"roughness {figure(after)}"
+        return "no surface shows", "nothing moved"
+    unit = f" {unit}" if unit else ""
+    return f"noise {figure(result.figures['noise'])}{unit}", f"moved by {figure(result.figures['move_median'])}{unit}, median"
 
 
 def _summary(figures: Figures) -> str:
