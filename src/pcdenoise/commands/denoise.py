@@ -301,7 +301,7 @@ class _Cleaning:
         if picture := self.pictures.get(job.source):
             unit = unit_of(scan)
             outputs.save_before_after(
-                picture, scan, result.points, notes=_notes(result, unit), unit=unit, overwrite=self.overwrite
+                picture, scan, result.points, notes=picture_notes(result, unit), unit=unit, overwrite=self.overwrite
             )
         self.pages[:] = [Page(scan.points, result.points, colours=outputs.colours(scan))]
         for text in traps(scan, figures["noise"] if figures["is_surface"] else None):
@@ -325,7 +325,7 @@ class _Cleaning:
         return io.select(cleaned, ~result.outlier) if self.config.outliers == "remove" else cleaned
 
 
-def _notes(result: Result, unit: str) -> tuple[str, str]:
+def picture_notes(result: Result, unit: str) -> tuple[str, str]:
     """What a picture says under its titles: how far points were off, and how far they moved."""
     if not result.steps:
         return "no surface shows", "nothing moved"
