@@ -303,7 +303,7 @@ class _Cleaning:
             outputs.save_before_after(
                 picture, scan, result.points, notes=picture_notes(result, unit), unit=unit, overwrite=self.overwrite
             )
-        self.pages[:] = [Page(scan.points, result.points, colours=outputs.colours(scan))]
+        self.pages[:] = [Page(scan.points, result.points, colours=outputs.colours(scan), unit=unit_of(scan))]
         for text in traps(scan, figures["noise"] if figures["is_surface"] else None):
             self.console.note(f"{job.source}: {text}")
         self.console.note(f"{job.target}: {_summary(figures)}" + (f"; picture {picture}" if picture else ""))

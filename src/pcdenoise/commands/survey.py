@@ -128,7 +128,9 @@ def traps(scan: Scan, noise: float | None) -> list[str]:
     points = scan.points[scan.finite]
     system = io.coordinate_system(scan)
     if system and (misfit := _misfit(system, points)):
-        said.append(f"the file's coordinate system cannot be right: it {misfit}; no unit is shown, correct the system at its source")
+        said.append(
+            f"the file's coordinate system cannot be right: it {misfit}; no unit is shown, correct the system at its source"
+        )
         system = None
     elif (system and system.unit == "degree") or (system is None and _looks_like_degrees(points)):
         said.append("x and y are degrees and heights are not, so that distances mean nothing; project the scan to metres first")
