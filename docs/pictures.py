@@ -1,7 +1,7 @@
 """The README's picture: `python docs/pictures.py` writes docs/images/before_after.png anew.
 
-It is what `pcdenoise denoise examples/ground.laz -o clean.laz --picture before_after.png` draws, 1280 pixels wide and in 256 colours, so
-that the page loads fast. Not here: the drawing itself (pcdenoise.evaluation).
+It is what `pcdenoise denoise examples/ground.laz -o clean.laz --picture before_after.png` draws, 1280 pixels wide and in
+256 colours, so that the page loads fast. Not here: the drawing itself (pcdenoise.evaluation).
 """
 
 from __future__ import annotations

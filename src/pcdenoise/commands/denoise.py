@@ -140,6 +140,7 @@ def denoise(
         n_threads = 1 if engine == "dask" else max(1, (os.cpu_count() or 1) // workers)
         settings = settings.model_copy(update={"threads": settings.threads or n_threads})
     jobs = plan(sources, output, suffix=suffix, format=format, share=share)
+    files.refuse_unknown([job.target for job in jobs], format)
     drawn = plan(sources, str(picture), format="png", share=share) if picture else []
     if is_far and any(STREAM in (job.source, job.target) for job in jobs):
         raise UsageError("-: workers have neither standard input nor output; name files, or leave --workers and --engine out")

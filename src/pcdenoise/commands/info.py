@@ -24,7 +24,13 @@ if TYPE_CHECKING:
 def info(
     inputs: options.Inputs,
     picture: Annotated[
-        str, option("--picture", metavar="OUT", help="Draw where the noise is: a .png, or a folder for several.")
+        str,
+        option(
+            "--picture",
+            callback=options.picture_known,
+            metavar="OUT",
+            help="Draw where the noise is: a .png, or a folder for several.",
+        ),
     ] = "",
     noise_map: Annotated[
         str, option("--noise-map", metavar="OUT", help="Write the scan with a column noise: a file, or a folder for several.")
