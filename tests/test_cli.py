@@ -367,3 +367,22 @@ def test_what_cannot_end_well_is_refused_before_any_work(
     assert words in said
     assert said.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_scan_is_read_before_torch_and_a_wrong_model_writes_nothing(run: Run, milk: Path, tmp_path: Path) -> None:
+    missing = run("denoise", tmp_path / "no.pcd", "-o", tmp_path / "out" / "o.pcd", "--model", "defualt")
+    assert missing.returncode == 3
+    wrong = run("denoise", milk, "-o", tmp_path / "out" / "o.pcd", "--model", "defualt")
+    assert wrong.returncode == 4
+    assert b"defualt: no such model" in wrong.stderr
+    several = run("denoise", milk, ROOT / "examples" / "ground.laz", "-o", f"{tmp_path}/out/", "--model", "defualt")
+    assert several.returncode == 4
+    assert list(tmp_path.iterdir()) == []
+    order = (
+        "import sys; from pcdenoise import io; from pcdenoise.commands import main; read = io.read\n"
+        "def seen(*a, **k): print('torch' in sys.modules); return read(*a, **k)\n"
+        "io.read = seen; main(sys.argv[1:])"
+    )
+    command = [sys.executable, "-c", order, "denoise", str(milk), "-o", str(tmp_path / "o.pcd"), "--strength", "0", "-q"]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT / "src")})
+    assert done.stdout.split() == ["False"], done.stderr

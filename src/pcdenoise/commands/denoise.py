@@ -6,7 +6,7 @@ import os
 import shutil
 import time
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -154,9 +154,11 @@ def denoise(
         shutil.rmtree(_cells_of(job), ignore_errors=True)
     chosen = selection.Selection.of(only_class, context, roi)
     cleaning = _Cleaning(
-        settings, chosen, chosen_model(model, settings), console, format, overwrite or is_far, drop_attributes, displacement,
+        settings, chosen, refuse_model(model, settings), console, format, overwrite or is_far, drop_attributes, displacement,
         max_drift, pictures, n_bytes(max_memory) // workers, tile, colour,
     )  # fmt: skip
+    if len(jobs) > 1 or is_far:
+        _ = cleaning.model  # one that is missing ends the run here, not each of its inputs
     batch = Batch(console)
     batch.run(jobs, cleaning.clean, run)
     if report:
@@ -166,14 +168,20 @@ def denoise(
 
 
 def chosen_model(name: str | None, settings: DenoiseConfig) -> Model | None:
-    """The network to use, or None for a classical filter."""
+    """The network to use, or None for a classical filter. Raises ModelError."""
+    refuse_model(name, settings)
     if settings.method != "network":
-        if name is not None:
-            raise UsageError(f"--model {name}: --method {settings.method} uses no model; leave one of the two out")
         return None
     from pcdenoise.networks import store
 
     return store.load(name) if name else store.load()
+
+
+def refuse_model(name: str | None, settings: DenoiseConfig) -> str | None:
+    """The name as it is. Raises UsageError where a model is named that no one would use."""
+    if settings.method != "network" and name is not None:
+        raise UsageError(f"--model {name}: --method {settings.method} uses no model; leave one of the two out")
+    return name
 
 
 def _cells_of(job: Job) -> Path:
@@ -190,7 +198,7 @@ class _Cleaning:
 
     config: DenoiseConfig
     selection: selection.Selection
-    model: Model | None
+    model_name: str | None
     console: Console
     format: str | None
     overwrite: bool
@@ -202,6 +210,11 @@ class _Cleaning:
     tile: int | None = None
     colour: bool = False
     pages: list[Page] = field(default_factory=list)
+
+    @cached_property
+    def model(self) -> Model | None:
+        """Loaded when it is first asked for, once a scan is read: torch takes seconds to import."""
+        return chosen_model(self.model_name, self.config)
 
     @property
     def settings(self) -> dict[str, Any]:
