@@ -182,7 +182,8 @@ def _telling_spot(before: tuple[_Cloud, Drawing], after: tuple[_Cloud, Drawing],
         inside = share > 0.999  # the means of an even slope cancel, those of a window cut off by an outline do not
         off = np.where(inside, np.minimum(np.abs(depth - around), 5), 0)
         whole, total = box_mean(np.stack([inside.astype(np.float64), off]), reach)
-        return total / np.maximum(whole, 0.05)
+        mean: NDArray[np.float64] = total / np.maximum(whole, 0.05)
+        return mean
 
     light = drawing.canvas.mean(axis=2, dtype=np.float64)
     shape = box_mean(np.abs(box_mean(light, reach // 4 + 1) - box_mean(light, reach // 2 + 2)), reach)
