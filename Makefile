@@ -13,9 +13,9 @@ setup: .venv/dev.stamp ## make .venv with pcdenoise and everything a developer n
 
 demo: .venv/run.stamp ## clean the shipped scan with the shipped model and show before and after, in demo/
 	@mkdir -p demo
-	$(BIN)/pcdenoise denoise examples/milk.pcd -o demo/milk_clean.pcd --overwrite \
+	$(BIN)/pcdenoise denoise examples/ground.laz -o demo/ground_clean.laz --overwrite \
 		--picture demo/before_after.png --report demo/report.html
-	@echo "Look at demo/before_after.png, open demo/report.html in a browser; the clean scan is demo/milk_clean.pcd."
+	@echo "Look at demo/before_after.png, open demo/report.html in a browser; the clean scan is demo/ground_clean.laz."
 
 test: .venv/dev.stamp ## all tests
 	$(BIN)/python -m pytest
@@ -28,9 +28,9 @@ lint: .venv/dev.stamp ## ruff (style and bugs) and import-linter (the layers)
 types: .venv/dev.stamp ## mypy --strict
 	$(BIN)/mypy
 
-docs: .venv/dev.stamp demo ## rebuild the command reference and the README's picture, and run every command of README and docs/
+docs: .venv/dev.stamp ## rebuild the command reference and the README's picture, and run every command of README and docs/
 	$(BIN)/python docs/reference.py
-	cp demo/before_after.png docs/images/
+	$(BIN)/python docs/pictures.py
 	$(BIN)/python -m pytest tests/test_docs.py
 
 site: .venv/dev.stamp ## docs/ as web pages, in build/site

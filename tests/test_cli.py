@@ -339,3 +339,50 @@ def test_what_tune_writes_denoise_reads(tmp_path: Path, rng: np.random.Generator
         assert main(["denoise", scan, "-o", str(tmp_path / f"{method}.ply"), "--config", str(tuned), "-q"]) == 0
         assert not np.array_equal(io.read(tmp_path / f"{method}.ply").points, io.read(scan).points)
     assert main(["tune", str(tmp_path / "clean.ply"), "--method", "mean", "-q"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "words"),
+    [
+        (["-o", "o.pcd", "--report", "r.docx"], 2, "--report r.docx: a report is written as .json, .csv"),
+        (["-o", "o.pcd", "--picture", "p.jpg"], 2, "--picture p.jpg: a picture is written as .png"),
+        (["-o", "o.foo"], 3, "o.foo: no suffix tells its format; add --format"),
+        (["-o", "-"], 3, "stdout: no suffix tells its format; add --format"),
+        (["-o", "o.pcd", "--iters", "many"], 2, "--iters: must be a number of passes from 1 to 100, or auto, got 'many'"),
+        (["-o", "o.pcd", "--config", "no.toml"], 2, "check the path"),
+    ],
+)
+def test_what_cannot_end_well_is_refused_before_any_work(
+    milk: Path,
+    options: list[str],
+    code: int,
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["denoise", str(milk), *options]) == code
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_scan_is_read_before_torch_and_a_wrong_model_writes_nothing(run: Run, milk: Path, tmp_path: Path) -> None:
+    missing = run("denoise", tmp_path / "no.pcd", "-o", tmp_path / "out" / "o.pcd", "--model", "defualt")
+    assert missing.returncode == 3
+    wrong = run("denoise", milk, "-o", tmp_path / "out" / "o.pcd", "--model", "defualt")
+    assert wrong.returncode == 4
+    assert b"defualt: no such model" in wrong.stderr
+    several = run("denoise", milk, ROOT / "examples" / "ground.laz", "-o", f"{tmp_path}/out/", "--model", "defualt")
+    assert several.returncode == 4
+    assert list(tmp_path.iterdir()) == []
+    order = (
+        "import sys; from pcdenoise import io; from pcdenoise.commands import main; read = io.read\n"
+        "def seen(*a, **k): print('torch' in sys.modules); return read(*a, **k)\n"
+        "io.read = seen; main(sys.argv[1:])"
+    )
+    command = [sys.executable, "-c", order, "denoise", str(milk), "-o", str(tmp_path / "o.pcd"), "--strength", "0", "-q"]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT / "src")})
+    assert done.stdout.split() == ["False"], done.stderr

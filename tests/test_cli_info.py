@@ -39,19 +39,19 @@ def geo_keys(*keys: tuple[int, int, int, int]) -> bytes:
     [
         (
             {crs.WKT: UTM_WKT.encode() + b"\0"},
-            crs.Crs("WGS 84 / UTM zone 17N", "metre", "NAVD88 height (ftUS)", "US survey foot"),
+            crs.Crs("WGS 84 / UTM zone 17N", "metre", "NAVD88 height (ftUS)", "US survey foot", "projected"),
         ),
-        ({crs.WKT: WKT2.encode()}, crs.Crs("RGF93 / Lambert-93", "metre")),
-        ({crs.GEO_KEYS: geo_keys((1024, 0, 1, 2), (2048, 0, 1, 4326))}, crs.Crs("EPSG:4326", "degree")),
+        ({crs.WKT: WKT2.encode()}, crs.Crs("RGF93 / Lambert-93", "metre", kind="projected")),
+        ({crs.GEO_KEYS: geo_keys((1024, 0, 1, 2), (2048, 0, 1, 4326))}, crs.Crs("EPSG:4326", "degree", kind="geographic")),
         (
             {
                 crs.GEO_KEYS: geo_keys((1024, 0, 1, 1), (3072, 0, 1, 32617), (3076, 0, 1, 9001), (4097, 34737, 7, 0)),
                 crs.GEO_TEXT: b"NAVD88|\0",
             },
-            crs.Crs("EPSG:32617", "metre", "NAVD88"),
+            crs.Crs("EPSG:32617", "metre", "NAVD88", kind="projected"),
         ),
         ({crs.WKT: b"''\0"}, None),
-        ({crs.WKT: b"PROJCS[" * 5000}, crs.Crs()),
+        ({crs.WKT: b"PROJCS[" * 5000}, crs.Crs(kind="projected")),
         ({crs.GEO_KEYS: b"\1\0\1\0\0\0\xff\xff\0"}, None),
         ({}, None),
     ],
@@ -124,3 +124,24 @@ def test_the_plan_of_a_dry_run_names_cost_and_traps_and_writes_nothing(
     assert "CPU s" in said
     assert "step of 0.1" in said
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_system_that_the_coordinates_cannot_have_is_doubted_and_lends_no_unit(tmp_path: Path) -> None:
+    """UTM coordinates under a heading of degrees, or of metres from the middle of the Earth (as real files have it)."""
+    utm = ([515_396.0, 4_918_348.0, 2324.0], [515_429.0, 4_918_389.0, 2340.0])
+    degrees = crs.parse({crs.GEO_KEYS: geo_keys((1024, 0, 1, 2), (2048, 0, 1, 4326))})
+    geocentric = crs.parse({crs.GEO_KEYS: geo_keys((1024, 0, 1, 3), (2048, 0, 1, 4326))})
+    assert degrees is not None
+    assert geocentric is not None
+    assert "x reaches 515,429" in degrees.misfit(*utm)
+    assert "underground" in geocentric.misfit(*utm)
+    assert geocentric.misfit([-1_891_000.0, -4_265_000.0, 4_330_000.0], [-1_890_000.0, -4_264_000.0, 4_440_000.0]) == ""
+    assert degrees.misfit([-110.8, 44.4, 2000.0], [-110.7, 44.5, 2400.0]) == ""
+    assert crs.Crs("EPSG:32612", "metre", kind=crs.PROJECTED).misfit(*utm) == ""
+    path = tmp_path / "wrong.las"
+    path.write_bytes(las(4, 6, vlrs=[vlr(b"LASF_Projection", crs.WKT, b'GEOGCS["WGS 84",UNIT["degree",0.0174532925199433]]')]))
+    scan = pcdenoise.read(path)
+    found = survey(scan.moved_to(scan.points + [515_396.0, 4_918_348.0, 2324.0]))
+    assert found["unit"] == ""
+    assert "cannot be right" in " | ".join(found["warnings"])
+    assert "project the scan" not in " | ".join(found["warnings"])

@@ -142,6 +142,6 @@ def test_make_demo_cleans_the_shipped_scan_and_leaves_a_picture(tmp_path: Path) 
         ["make", "demo"], cwd=tmp_path, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(tmp_path / "src")}
     )
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "demo" / "milk_clean.pcd").stat().st_size > 100_000
+    assert (tmp_path / "demo" / "ground_clean.laz").stat().st_size > 100_000
     assert (tmp_path / "demo" / "before_after.png").read_bytes().startswith(b"\x89PNG")
     assert "before_after.png" in done.stdout + done.stderr

@@ -196,8 +196,32 @@ def test_the_detail_is_taken_where_points_moved(rng: np.random.Generator) -> Non
     before[rough, 1] += rng.normal(0, 0.03, rough.sum())
     clouds = [pictures._Cloud.of(points, None) for points in (before, plate)]
     drawings = [cloud.draw(front(), SIZE) for cloud in clouds]
-    spot = pictures._telling_spot(*drawings, clouds[1], front(), (160, 74))
+    spot = pictures._telling_spot(*zip(clouds, drawings, strict=True), front(), (160, 74))
     assert spot.camera.target[0] > 0.2
+
+
+def test_the_detail_is_not_taken_among_leaves_that_stay_as_they_were(rng: np.random.Generator) -> None:
+    """A bush in front of one half of a plate: it is rougher than any noise, but only the other half becomes smoother."""
+    plate = np.column_stack([rng.uniform(-1, 1, 30_000), np.zeros(30_000), rng.uniform(-1, 1, 30_000)])
+    bush = np.column_stack([rng.uniform(-1, -0.2, 8000), rng.uniform(-0.4, 0, 8000), rng.uniform(-1, 1, 8000)])
+    noise = np.zeros((38_000, 3))
+    noise[:30_000, 1] = rng.normal(0, 0.01, 30_000)
+    noise[30_000:] = rng.normal(0, 0.002, (8000, 3))
+    after = np.concatenate([plate, bush])
+    clouds = [pictures._Cloud.of(points, None) for points in (after + noise, after)]
+    spot = pictures._telling_spot(*[(cloud, cloud.draw(front(), SIZE)) for cloud in clouds], front(), (160, 74))
+    assert spot.camera.target[0] > -0.2
+
+
+def test_a_flat_section_is_stretched_and_a_steep_one_is_not(rng: np.random.Generator) -> None:
+    flat = np.column_stack([rng.uniform(-1, 1, 20_000), np.zeros(20_000), rng.uniform(-1, 1, 20_000)])
+    spot = pictures._Spot(np.array([80.0, 60.0]), (160.0, 74.0), front(), 0.5, 0.01)
+    stretches = []
+    for height in (0.002, 0.15):
+        curved = flat + np.sin(6 * flat[:, :1]) * [0, height, 0]
+        stretches.append(pictures._section(curved, curved, spot, (160, 74), ("a", "b"), "")[1])
+    assert stretches[0] > 5
+    assert stretches[1] == 1
 
 
 def test_before_after_has_a_third_column_only_for_the_same_rows(rng: np.random.Generator) -> None:

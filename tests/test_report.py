@@ -275,3 +275,16 @@ def test_displacement_is_known_only_where_both_ends_are() -> None:
     np.testing.assert_array_equal(moved.values, [5, np.nan, np.nan])
     assert moved.label == "Displacement (m)"
     assert displacement(before, after[:2]) is None
+
+
+def test_a_page_names_its_scan_and_shows_only_settings_that_were_made(tmp_path: Path) -> None:
+    path = tmp_path / "r.html"
+    files = [{"input": "folder/a.las", "output": "-", "status": "done", "figures": {"move_median": 0.1}}]
+    report.write_report(path, {"command": "denoise", "settings": {"iters": 3, "radius": None}, "figures": {}, "files": files})
+    page = path.read_text()
+    assert "pcdenoise denoise: a.las" in page
+    assert "Passes" in page
+    assert "Radius" not in page
+    report.write_report(path, {"command": "denoise", "figures": {}, "files": files * 2})
+    assert "Move, median" in path.read_text()
+    assert "Output" not in path.read_text()

@@ -7,7 +7,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -142,6 +142,7 @@ def denoise(
         n_threads = 1 if engine == "dask" else max(1, (os.cpu_count() or 1) // workers)
         settings = settings.model_copy(update={"threads": settings.threads or n_threads})
     jobs = plan(sources, output, suffix=suffix, format=format, share=share)
+    files.refuse_unknown([job.target for job in jobs], format)
     drawn = plan(sources, str(picture), format="png", share=share) if picture else []
     if is_far and any(STREAM in (job.source, job.target) for job in jobs):
         raise UsageError("-: workers have neither standard input nor output; name files, or leave --workers and --engine out")
@@ -155,9 +156,11 @@ def denoise(
         shutil.rmtree(_cells_of(job), ignore_errors=True)
     chosen = selection.Selection.of(only_class, context, roi)
     cleaning = _Cleaning(
-        settings, chosen, chosen_model(model, settings), console, format, overwrite or is_far, drop_attributes, displacement,
+        settings, chosen, refuse_model(model, settings), console, format, overwrite or is_far, drop_attributes, displacement,
         max_drift, pictures, n_bytes(max_memory) // workers, tile, colour,
     )  # fmt: skip
+    if len(jobs) > 1 or is_far:
+        _ = cleaning.model  # one that is missing ends the run here, not each of its inputs
     batch = Batch(console)
     batch.run(jobs, cleaning.clean, run)
     if report:
@@ -167,14 +170,20 @@ def denoise(
 
 
 def chosen_model(name: str | None, settings: DenoiseConfig) -> Model | None:
-    """The network to use, or None for a classical filter."""
+    """The network to use, or None for a classical filter. Raises ModelError."""
+    refuse_model(name, settings)
     if settings.method != "network":
-        if name is not None:
-            raise UsageError(f"--model {name}: --method {settings.method} uses no model; leave one of the two out")
         return None
     from pcdenoise.networks import store
 
     return store.load(name) if name else store.load()
+
+
+def refuse_model(name: str | None, settings: DenoiseConfig) -> str | None:
+    """The name as it is. Raises UsageError where a model is named that no one would use."""
+    if settings.method != "network" and name is not None:
+        raise UsageError(f"--model {name}: --method {settings.method} uses no model; leave one of the two out")
+    return name
 
 
 def _cells_of(job: Job) -> Path:
@@ -201,7 +210,7 @@ class _Cleaning:
 
     config: DenoiseConfig
     selection: selection.Selection
-    model: Model | None
+    model_name: str | None
     console: Console
     format: str | None
     overwrite: bool
@@ -213,6 +222,11 @@ class _Cleaning:
     tile: int | None = None
     colour: bool = False
     pages: list[Page] = field(default_factory=list)
+
+    @cached_property
+    def model(self) -> Model | None:
+        """Loaded when it is first asked for, once a scan is read: torch takes seconds to import."""
+        return chosen_model(self.model_name, self.config)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -294,7 +308,7 @@ class _Cleaning:
 
     def _clean_whole(self, job: Job) -> Figures:
         from pcdenoise import io
-        from pcdenoise.commands.survey import traps
+        from pcdenoise.commands.survey import traps, unit_of
         from pcdenoise.denoising import denoiser
         from pcdenoise.denoising.part import denoise_part
         from pcdenoise.evaluation.report import Page
@@ -317,8 +331,11 @@ class _Cleaning:
         )  # fmt: skip
         figures = {"points": len(scan), **result.figures, "seconds": round(time.perf_counter() - started, 3)}
         if picture := self.pictures.get(job.source):
-            outputs.save_before_after(picture, scan, result.points, notes=_notes(result), overwrite=self.overwrite)
-        self.pages[:] = [Page(scan.points, result.points, colours=outputs.colours(scan))]
+            unit = unit_of(scan)
+            outputs.save_before_after(
+                picture, scan, result.points, notes=picture_notes(result, unit), unit=unit, overwrite=self.overwrite
+            )
+        self.pages[:] = [Page(scan.points, result.points, colours=outputs.colours(scan), unit=unit_of(scan))]
         for text in traps(scan, figures["noise"] if figures["is_surface"] else None):
             self.console.note(f"{job.source}: {text}")
         self.console.note(f"{job.target}: {_summary(figures)}" + (f"; picture {picture}" if picture else ""))
@@ -340,12 +357,12 @@ class _Cleaning:
         return io.select(cleaned, ~result.outlier) if self.config.outliers == "remove" else cleaned
 
 
-def _notes(result: Result) -> tuple[str, str]:
-    """The roughness before the first pass and after the last, for a picture."""
+def picture_notes(result: Result, unit: str) -> tuple[str, str]:
+    """What a picture says under its titles: how far points were off, and how far they moved."""
     if not result.steps:
-        return "", "nothing moved"
-    before, after = result.steps[0].figures["roughness_before"], result.steps[-1].figures["roughness_after"]
-    return f"roughness {figure(before)}", f"roughness {figure(after)}"
+        return "no surface shows", "nothing moved"
+    unit = f" {unit}" if unit else ""
+    return f"noise {figure(result.figures['noise'])}{unit}", f"moved by {figure(result.figures['move_median'])}{unit}, median"
 
 
 def _summary(figures: Figures) -> str:

@@ -136,6 +136,16 @@ def refuse_existing(targets: Sequence[Path | None], overwrite: bool) -> None:
             raise ScanError(f"{target}: the file exists; add --overwrite to replace it")
 
 
+def refuse_unknown(targets: Sequence[Path], format: str | None) -> None:
+    """Raises ScanError before any work is done if nothing says what format a target is to have."""
+    from pcdenoise import io
+
+    for target in targets:
+        if format is None and not io.is_scan(target):
+            name = "stdout" if target == STREAM else str(target)
+            raise ScanError(f"{name}: no suffix tells its format; add --format, or one of {' '.join(sorted(io.SUFFIXES))}")
+
+
 def format_of(path: Path, format: str | None) -> str | None:
     """The format to read or write a path as: what --format says for `-` and where the suffix says nothing, else None."""
     from pcdenoise import io

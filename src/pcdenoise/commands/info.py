@@ -24,7 +24,13 @@ if TYPE_CHECKING:
 def info(
     inputs: options.Inputs,
     picture: Annotated[
-        str, option("--picture", metavar="OUT", help="Draw where the noise is: a .png, or a folder for several.")
+        str,
+        option(
+            "--picture",
+            callback=options.picture_known,
+            metavar="OUT",
+            help="Draw where the noise is: a .png, or a folder for several.",
+        ),
     ] = "",
     noise_map: Annotated[
         str, option("--noise-map", metavar="OUT", help="Write the scan with a column noise: a file, or a folder for several.")
@@ -114,7 +120,8 @@ def _as_text(path: Path, found: dict[str, Any]) -> str:
             pairs.append(("noise map", f"{figure(found['noise_p5'])} to {figure(found['noise_p95'])} at 5 % and 95 %{shown}"))
         pairs.append(("outliers", f"{found['outlier_share']:.3%} of the points"))
     if system := found["crs"]:
-        pairs.append(("system", str(Crs(**system))))
+        doubt = "" if found["unit"] == system["unit"] else "; not to be believed, see the warning"
+        pairs.append(("system", f"{Crs(**system)}{doubt}"))
     if step := found["coordinate_step"]:
         pairs.append(("step", f"{step:g}: coordinates are multiples of it, {_step_share(found)}"))
     names = ", ".join(f"{name} ({dtype})" for name, dtype in found["attributes"].items())
@@ -140,7 +147,7 @@ def _noise(found: dict[str, Any]) -> str:
     if not found["is_surface"]:
         return "no surface at any scale: leaves, clutter, a filled volume, or too few points to tell"
     spacings = found["noise"] / found["spacing"]
-    unit = (found["crs"] or {}).get("unit", "")
+    unit = found["unit"]
     share = f"{found['noise_share_of_diagonal']:.3%} of the diagonal, {spacings:.2g} spacings"
     return f"{figure(found['noise'])}{' ' if unit else ''}{unit} ({share})"
 

@@ -124,15 +124,15 @@ def _save_strip(path: Path, scan: Scan, passes: list[_Pass], overwrite: bool) ->
 
 def _save_report(path: Path, scan: Scan, passes: list[_Pass], settings: dict[str, Any], overwrite: bool) -> None:
     from pcdenoise.evaluation.charts import curve
-    from pcdenoise.evaluation.report import Page
+    from pcdenoise.evaluation.report import Page, in_words
 
     last = passes[-1]
     numbers = range(len(passes))
-    names = [name for name, value in last.figures.items() if isinstance(value, float)]
+    names = [name for name, value in last.figures.items() if isinstance(value, float) and name != "roughness_before"]
     charts = [
         curve(
-            {name: [entry.figures.get(name, float("nan")) for entry in passes]},
-            title=name.replace("_", " ").capitalize(),
+            {"": [entry.figures.get(name, float("nan")) for entry in passes]},
+            title=in_words(name),
             x_label="Pass",
         )
         for name in names

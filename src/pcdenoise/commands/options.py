@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
@@ -47,7 +48,7 @@ def _defaults_from(path: Path, context: typer.Context) -> dict[str, Any]:
             raise ValueError(f"larger than {_LARGEST_CONFIG} bytes")
         settings = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise UsageError(f"{path}: not a readable TOML file ({_one_line(error)})") from None
+        raise UsageError(f"{path}: not a readable TOML file ({_one_line(error)}); check the path and what it holds") from None
     assert context.parent is not None
     group = context.parent.command
     commands: dict[str, Any] = getattr(group, "commands", {})
@@ -96,9 +97,28 @@ def configured(model: type[ConfigModel], **values: Any) -> ConfigModel:
     except ValidationError as error:
         first = error.errors()[0]
         name = _flag(str(first["loc"][0])) if first["loc"] else "options"
-        message = first["msg"].removeprefix("Value error, ")
+        message = (
+            first["msg"].removeprefix("Value error, ").replace("input should be", "must be").replace("Input should be", "must be")
+        )
+        if first["loc"][:1] == ("iters",):
+            message = "must be a number of passes from 1 to 100, or auto"
         raise UsageError(f"{name}: {message[0].lower()}{message[1:]}, got {first['input']!r}") from None
 
+
+def _suffix_known(option_name: str, suffixes: tuple[str, ...], what: str) -> Callable[[Any], Any]:
+    """A callback that refuses a file of another suffix before any work is done; a folder has none."""
+
+    def check(value: Any) -> Any:
+        suffix = Path(str(value or "")).suffix.lower()
+        if suffix and suffix not in suffixes and not Path(str(value)).is_dir():
+            raise UsageError(f"{option_name} {value}: {what} is written as {', '.join(suffixes)}; choose such a suffix")
+        return value
+
+    return check
+
+
+report_known = _suffix_known("--report", (".json", ".csv", ".html", ".htm"), "a report")
+picture_known = _suffix_known("--picture", (".png",), "a picture")
 
 Inputs = Annotated[
     list[str], argument(metavar="IN...", help="Scans: files, folders, patterns like 'tiles/*.laz', or - for stdin.")
@@ -116,9 +136,12 @@ Model = Annotated[
     str | None, option("--model", metavar="NAME|DIR", help="A shipped model (see pcdenoise models) or a model folder.")
 ]
 Report = Annotated[
-    Path | None, option("--report", metavar="FILE", help="Write figures and settings to a .json, .csv or .html file.")
+    Path | None,
+    option("--report", callback=report_known, metavar="FILE", help="Write figures and settings to a .json, .csv or .html file."),
 ]
-Picture = Annotated[Path | None, option("--picture", metavar="FILE", help="Write a .png picture; needs no display.")]
+Picture = Annotated[
+    Path | None, option("--picture", callback=picture_known, metavar="FILE", help="Write a .png picture; needs no display.")
+]
 Overwrite = Annotated[bool, option("--overwrite", help="Replace files that exist.")]
 Seed = Annotated[int, common("--seed", min=0, help="Same seed, same bytes.")]
 Threads = Annotated[int | None, common("--threads", min=1, help="Threads to use; all cores if not given.")]

@@ -69,9 +69,9 @@ def colours(scan: Scan) -> dict[str, Colour]:
     return found
 
 
-def save_before_after(path: Path, scan: Scan, after: Points, *, notes: tuple[str, str], overwrite: bool) -> None:
-    """A picture of a scan and of the same rows cleaned, side by side, each with a note."""
+def save_before_after(path: Path, scan: Scan, after: Points, *, notes: tuple[str, str], overwrite: bool, unit: str = "") -> None:
+    """A picture of a scan and of the same rows cleaned, side by side, each with a note; unit: of the coordinates."""
     from pcdenoise.evaluation.pictures import before_after, write_png
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_png(path, before_after(scan.points, after, colour=rgb(scan), notes=notes), overwrite=overwrite)
+    write_png(path, before_after(scan.points, after, colour=rgb(scan), notes=notes, unit=unit), overwrite=overwrite)

@@ -12,13 +12,15 @@ from pcdenoise.commands.files import attachments
 
 if TYPE_CHECKING:
     from pcdenoise.cloud.scan import Points, Scan
+    from pcdenoise.io.crs import Crs
 
 N_NEIGHBOURS = 16
 """Nearest points whose disc gives the density."""
 
-CPU_S, CPU_S_PER_POINT = 2.5, 40e-6
-BYTES, BYTES_PER_POINT = 0.42e9, 1300
-"""Cost of one pass of the shipped model on a common core: a line through what `/usr/bin/time -v` says of 100K and 400K points."""
+PASS_CPU_S_PER_POINT = 90e-6
+"""CPU seconds that one pass of the shipped model takes for a point; to be set anew when the pass becomes faster."""
+START_CPU_S, START_BYTES, BYTES_PER_POINT = 5.0, 0.36e9, 950
+"""What a run costs beside that: a line through what `/usr/bin/time -v pcdenoise denoise` says of 42K and 519K points."""
 
 _MOST_JUDGED = 200_000  # points of which outliers are counted
 _BLOCKS = 4  # compact parts of the cloud that they are taken from
@@ -58,6 +60,7 @@ def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
         "attributes": {name: str(values.dtype) for name, values in scan.attributes.items()},
         "beside": attachments(scan),
         "crs": None if system is None else vars(system),
+        "unit": unit_of(scan),
         "coordinate_step": io.coordinate_step(scan),
     }
     if len(places) < 2:
@@ -93,8 +96,8 @@ def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
 def cost(n_points: int, n_passes: int = 1) -> dict[str, float]:
     """Processor seconds and bytes of memory that cleaning so many points takes, roughly: machines differ."""
     return {
-        "expected_cpu_s": CPU_S + CPU_S_PER_POINT * n_points * n_passes,
-        "expected_memory_mb": (BYTES + BYTES_PER_POINT * n_points) / 1e6,
+        "expected_cpu_s": START_CPU_S + PASS_CPU_S_PER_POINT * n_points * n_passes,
+        "expected_memory_mb": (START_BYTES + BYTES_PER_POINT * n_points) / 1e6,
     }
 
 
@@ -124,7 +127,12 @@ def traps(scan: Scan, noise: float | None) -> list[str]:
     said = []
     points = scan.points[scan.finite]
     system = io.coordinate_system(scan)
-    if (system and system.unit == "degree") or (system is None and _looks_like_degrees(points)):
+    if system and (misfit := _misfit(system, points)):
+        said.append(
+            f"the file's coordinate system cannot be right: it {misfit}; no unit is shown, correct the system at its source"
+        )
+        system = None
+    elif (system and system.unit == "degree") or (system is None and _looks_like_degrees(points)):
         said.append("x and y are degrees and heights are not, so that distances mean nothing; project the scan to metres first")
     elif system and system.unit and system.vertical_unit and system.unit != system.vertical_unit:
         said.append(f"x and y are in {system.unit}, heights in {system.vertical_unit}; convert one of them first")
@@ -136,6 +144,18 @@ def traps(scan: Scan, noise: float | None) -> list[str]:
         fix = "export from the source in float64, or with an offset"
         said.append(f"coordinates were rounded to float32, in steps of {step:g} so far from the origin; {fix}")
     return said
+
+
+def _misfit(system: Crs, points: Points) -> str:
+    return system.misfit(points.min(axis=0).tolist(), points.max(axis=0).tolist()) if len(points) else ""
+
+
+def unit_of(scan: Scan) -> str:
+    """The unit of a scan's coordinates, or nothing where its file names none or one that cannot be right."""
+    from pcdenoise import io
+
+    system = io.coordinate_system(scan)
+    return "" if system is None or _misfit(system, scan.points[scan.finite]) else system.unit
 
 
 def _looks_like_degrees(points: Points) -> bool:

@@ -113,7 +113,7 @@ def _save_report(path: Path, output: Path, settings: dict[str, Any], figures: di
     errors = {"": [line["error"] for line in lines]}
     chart = curve(errors, title="Error, of the noise", x_label="Step", x=[line["step"] for line in lines])
     files = [{"input": ", ".join(settings["data"] or []), "output": str(output), "status": "done", "figures": figures}]
-    outputs.save_report(path, "train", settings, files, Page(charts=[chart]), overwrite=overwrite)
+    outputs.save_report(path, "train", settings, files, Page(charts=[chart] if lines else []), overwrite=overwrite)
 
 
 def _seconds(text: str | None) -> float | None:

@@ -24,6 +24,7 @@ Array = NDArray[np.float32]
 
 BEFORE_INK, AFTER_INK = (0.86, 0.45, 0.27), (0.09, 0.30, 0.47)
 _DOT = 1.15  # radius of a dot over the distance between neighbours: closes the surface
+_STRETCHES, _FILLED = (1, 2, 5, 10, 20), 0.6  # how much larger heights of a section may be, and how much of it they may fill
 
 View: TypeAlias = Camera | tuple[float, float] | None
 """A camera, (azimuth, elevation) in degrees, or None for a good one."""
@@ -73,10 +74,13 @@ def before_after(
         clouds.append(_Cloud.of(after, moved))
     camera = _camera(view, clouds[1].points, size)
     drawings = [cloud.draw(camera, size) for cloud in clouds]
-    spot = _telling_spot(drawings[0], drawings[1], clouds[1], camera, detail_size)
+    spot = _telling_spot((clouds[0], drawings[0]), (clouds[1], drawings[1]), camera, detail_size)
     close_ups = [cloud.draw(spot.camera, detail_size).canvas for cloud in clouds[:2]]
+    captions = [f"Detail, {panel / spot.window[0]:.1f} times larger"] * 2
     if moved is not None:
-        close_ups.append(_section(clouds[0].points, clouds[1].points, spot, detail_size, titles, unit))
+        section, stretch = _section(clouds[0].points, clouds[1].points, spot, detail_size, titles, unit)
+        close_ups.append(section)
+        captions.append("Section through the surface there" + (f", heights {stretch} times larger" if stretch > 1 else ""))
     canvas = raster.blank(width, header + size[1] + caption + detail_size[1] + edge)
     for column, drawing in enumerate(drawings):
         x = edge + column * (panel + gap)
@@ -88,9 +92,7 @@ def before_after(
             _colour_bar(canvas, scalar, x + panel - 230, 46, 230)
         raster.paste(canvas, x, header, drawing.canvas, radius=10)
         y = header + size[1] + caption
-        zoom = f"Detail, {panel / spot.window[0]:.1f} times larger"
-        words = "Section through the surface there" if column == 2 else zoom
-        raster.write(canvas, x, y - 14, words, 9.5, FAINT_INK)
+        raster.write(canvas, x, y - 14, captions[column], 9.5, FAINT_INK)
         raster.paste(canvas, x, y, close_ups[column], radius=10)
     return raster.to_image(canvas)
 
@@ -158,40 +160,58 @@ def _camera(view: View, points: Points, size: tuple[int, int]) -> Camera:
     return view if isinstance(view, Camera) else camera_for(points, size, view)
 
 
-def _telling_spot(before: Drawing, after: Drawing, cloud: _Cloud, camera: Camera, detail_size: tuple[int, int]) -> _Spot:
-    """Where a window of the picture loses most of its roughness, shows some shape and lies within the surface."""
-    size = after.canvas.shape[1::-1]
+def _telling_spot(before: tuple[_Cloud, Drawing], after: tuple[_Cloud, Drawing], camera: Camera, panel: tuple[int, int]) -> _Spot:
+    """Where a window of the picture loses most of its scatter, shows some shape and lies within a surface, not among leaves.
+
+    Scatter is how far the points seen lie before or behind the mean depth around them, in spacings.
+    """
+    cloud, drawing = after
+    size = drawing.canvas.shape[1::-1]
     zoom = size[1] / 2 / camera.half_height
     spacing = float(np.median(cloud.radius)) / _DOT if len(cloud.radius) else camera.half_height
     width = float(np.clip(60 * spacing * zoom, size[0] / 8, size[0] / 2.8))
-    window = (width, width * detail_size[1] / detail_size[0])
+    window = (width, width * panel[1] / panel[0])
     reach = int(window[1] / 2)
+    near = max(2, int(1.5 * spacing * zoom))
 
-    def roughness(drawing: Drawing) -> NDArray[np.float64]:
-        light = drawing.canvas.mean(axis=2, dtype=np.float64)
-        return box_mean(np.abs(light - box_mean(light, 2)), reach)
+    def scatter(cloud: _Cloud, drawing: Drawing) -> NDArray[np.float64]:
+        seen = drawing.owner >= 0
+        depth = np.zeros(seen.shape)
+        depth[seen] = (cloud.points[drawing.owner[seen]] - camera.target) @ camera.axes[2] / spacing
+        share, around = box_mean(np.stack([seen.astype(np.float64), depth]), near)
+        inside = share > 0.999  # the means of an even slope cancel, those of a window cut off by an outline do not
+        off = np.where(inside, np.minimum(np.abs(depth - around), 5), 0)
+        whole, total = box_mean(np.stack([inside.astype(np.float64), off]), reach)
+        mean: NDArray[np.float64] = total / np.maximum(whole, 0.05)
+        return mean
 
-    light = after.canvas.mean(axis=2, dtype=np.float64)
+    light = drawing.canvas.mean(axis=2, dtype=np.float64)
     shape = box_mean(np.abs(box_mean(light, reach // 4 + 1) - box_mean(light, reach // 2 + 2)), reach)
-    covered = box_mean(np.stack([before.owner >= 0, after.owner >= 0]).astype(np.float64), int(width / 2)).min(axis=0)
-    rough, smooth = roughness(before), roughness(after)
-    score = (rough - smooth) / (smooth + 0.02) * (0.25 + np.minimum(shape / 0.04, 1)) * covered**6
-    score[after.owner < 0] = -np.inf
+    owners = np.stack([before[1].owner, drawing.owner])
+    covered = box_mean((owners >= 0).astype(np.float64), int(width / 2)).min(axis=0)
+    rough, smooth = scatter(*before), scatter(*after)
+    score = (rough - smooth) / (smooth + 0.1) * (0.25 + np.minimum(shape / 0.04, 1)) * covered**12
+    score[drawing.owner < 0] = -np.inf
     half_x, half_y = int(width / 2) + 2, reach + 2
     score[:half_y], score[-half_y:], score[:, :half_x], score[:, -half_x:] = -np.inf, -np.inf, -np.inf, -np.inf
     y, x = np.unravel_index(int(score.argmax()), score.shape)
-    target = cloud.points[after.owner[y, x]] if after.owner[y, x] >= 0 else camera.target
+    target = cloud.points[drawing.owner[y, x]] if drawing.owner[y, x] >= 0 else camera.target
     close = camera.zoomed(size[1] / window[1], target)
     return _Spot(np.array([x, y]) + 0.5, window, close, width / zoom / 2, spacing)
 
 
-def _section(before: Points, after: Points, spot: _Spot, size: tuple[int, int], titles: tuple[str, str], unit: str) -> Canvas:
-    """The points of a thin slab across the surface at the spot, seen along the surface: noise is the width of the band."""
+def _section(
+    before: Points, after: Points, spot: _Spot, size: tuple[int, int], titles: tuple[str, str], unit: str
+) -> tuple[Canvas, int]:
+    """The points of a thin slab across the surface at the spot, seen along the surface: noise is the width of the band.
+
+    Heights are drawn so many times larger, the second value, that the band shows and still fits.
+    """
     canvas = raster.blank(*size, (1.0, 1.0, 1.0))
     centre = spot.camera.target
     near = after[((after - centre) ** 2).sum(axis=1) < (0.3 * spot.half_width) ** 2]
     if len(near) < 3:
-        return canvas
+        return canvas, 1
     right, up, back = spot.camera.axes
     normal = np.linalg.eigh(np.cov(near.T))[1][:, 0]
     normal *= np.sign(normal @ back) or 1.0
@@ -200,16 +220,33 @@ def _section(before: Points, after: Points, spot: _Spot, size: tuple[int, int], 
     along /= np.linalg.norm(along)
     across = np.cross(normal, along)
     zoom = size[0] / 2 / spot.half_width
-    for points, ink in ((before, BEFORE_INK), (after, AFTER_INK)):
+    slabs = []
+    for points in (before, after):
         offset = points - centre
-        slab = offset[np.abs(offset @ across) < 2.5 * spot.spacing]
-        x, y = slab @ along * zoom + size[0] / 2, size[1] / 2 - slab @ normal * zoom
-        raster.dots(canvas, np.stack([x, y], axis=1), 2.6, ink, 0.85)
+        place, height = offset @ along * zoom, offset @ normal * zoom
+        slabs.append(
+            np.stack([place, height])[
+                :, (np.abs(offset @ across) < spot.spacing) & (np.abs(place) < size[0] / 2) & (np.abs(height) < size[1] / 2)
+            ]
+        )
+    middle, room = _relief(slabs[0][1])
+    stretch = max((times for times in _STRETCHES if times * room < _FILLED * size[1]), default=1)
+    for (place, height), ink in zip(slabs, (BEFORE_INK, AFTER_INK), strict=True):
+        pixels = np.stack([place + size[0] / 2, size[1] / 2 - stretch * (height - middle)], axis=1)
+        raster.dots(canvas, pixels, 2.6, ink, 0.85)
     for row, (name, ink) in enumerate(zip(titles, (BEFORE_INK, AFTER_INK), strict=True)):
         raster.dots(canvas, [(24, 22 + 20 * row)], 4, ink)
         raster.write(canvas, 36, 26 + 20 * row, name, 9)
     _length_bar(canvas, zoom, unit)
-    return canvas
+    return canvas, stretch
+
+
+def _relief(heights: NDArray[np.float64]) -> tuple[float, float]:
+    """The middle of heights and the distance between their ends, without the few that lie far off."""
+    if not len(heights):
+        return 0.0, 0.0
+    low, high = np.percentile(heights, [1, 99])
+    return float(low + high) / 2, float(high - low)
 
 
 def _length_bar(canvas: Canvas, zoom: float, unit: str) -> None:

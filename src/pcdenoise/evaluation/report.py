@@ -22,6 +22,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from html import escape
 from importlib import resources
@@ -41,6 +42,16 @@ from pcdenoise.evaluation.scene import pack
 
 SCHEMA = "pcdenoise-report/1"
 Report = Mapping[str, Any]
+_WORDS = {
+    "move_median": "move, median", "move_p95": "move, 95 % below", "move_p99": "move, 99 % below", "move_max": "move, longest",
+    "is_surface": "shows a surface", "drift_inward": "drift, inward", "roughness_before": "scatter before",
+    "roughness_after": "scatter after", "held_out": "residual of held-out points", "iters": "passes", "iterations": "passes",
+    "cd": "Chamfer distance (1e-4, unit sphere)", "p2s": "to the surface (1e-4, unit sphere)",
+    "p2m": "to and from the surface (1e-4, unit sphere)", "td": "Total Denoising's error (% of the diagonal)",
+    "shrinkage": "shrinkage (% of the diagonal)", "normal_error": "error of normals (\u00b0)",
+    "cpu_s": "CPU (s)",
+}  # fmt: skip
+"""How a page says what JSON calls so."""
 _UNITS = {"m": "m", "mm": "mm", "s": "s", "percent": "%", "mb": "MB", "deg": "\u00b0"}
 
 
@@ -84,8 +95,10 @@ def write_report(path: str | PathLike[str], report: Report, page: Page | None = 
         write_csv(path, report.get("files", []), overwrite=overwrite)
     elif suffix in {".html", ".htm"}:
         page = page or Page()
-        tables = {**page.tables, **({"Files": report["files"]} if len(report.get("files", [])) > 1 else {})}
-        title = str(report.get("title") or f"pcdenoise {report.get('command', '')}".strip())
+        files = report.get("files", [])
+        tables = page.tables or ({"Files": [_line(record) for record in files]} if len(files) > 1 else {})
+        name = f": {PurePath(str(files[0]['input'])).name}" if len(files) == 1 and files[0].get("input") else ""
+        title = str(report.get("title") or f"pcdenoise {report.get('command', '')}{name}".strip())
         write_html(
             path,
             title=title,
@@ -130,8 +143,10 @@ def write_html(
     charts = list(page.charts) or _displacement_chart(page)
     side = [_card("Figures", _table(figures)) if figures else ""]
     side += [_card(chart.title, chart.svg(), "chart") for chart in charts]
-    side += [_card("Settings", _table(settings)) if settings else ""]
     wide = [_card(name, _grid(rows), "wide") for name, rows in page.tables.items()]
+    chosen = {key: value for key, value in (settings or {}).items() if value not in (None, "")}
+    if chosen:
+        (wide if scene else side).append(_card("Settings", _table(chosen), "wide settings" if scene else ""))
     if page.pictures:
         wide.append(_card("Pictures", "".join(_figure(name, image) for name, image in page.pictures.items()), "wide", "pictures"))
     template = resources.files("pcdenoise.evaluation").joinpath("viewer.html").read_text(encoding="utf-8")
@@ -181,6 +196,12 @@ def _flat(row: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             flat[prefix + key] = "" if value is None else json.dumps(value) if isinstance(value, list) else value
     return flat
+
+
+def _line(record: Mapping[str, Any]) -> dict[str, Any]:
+    """A record of a batch as a row of a table: its figures beside its names, without an output that was not written."""
+    named = {key: value for key, value in plain(record).items() if key != "figures" and value not in (None, "", "-")}
+    return {**named, **(record.get("figures") or {})}
 
 
 def _scene(page: Page) -> tuple[dict[str, Any] | None, str]:
@@ -234,13 +255,17 @@ def _grid(rows: Sequence[Mapping[str, Any]]) -> str:
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
-def _name(key: str) -> str:
-    """`noise_std_m` as `Noise std (m)`."""
-    words = key.replace(".", ": ").split("_")
+def in_words(key: str) -> str:
+    """A key of a report as a page says it: `noise_std_m` is `Noise std (m)`."""
+    words = _WORDS.get(key, key).replace(".", ": ").split("_")
     if len(words) > 1 and words[-1] in _UNITS:
         words[-1] = f"({_UNITS[words[-1]]})"
     name = " ".join(words)
-    return escape(name[:1].upper() + name[1:])
+    return name[:1].upper() + name[1:]
+
+
+def _name(key: str) -> str:
+    return escape(in_words(key))
 
 
 def _is_number(value: Any) -> bool:
@@ -252,4 +277,10 @@ def _cell(value: Any) -> str:
         return "yes" if value else "no"
     if value in (None, ""):
         return "\u2013"
-    return short(value) if _is_number(value) else escape(str(value))
+    if _is_number(value):
+        return short(value)
+    text = str(value)
+    if text.startswith("[") and text.endswith("]"):  # a list, as `_flat` left it
+        with suppress(ValueError):
+            text = ", ".join(item if isinstance(item, str) else f"{item:g}" for item in json.loads(text))
+    return escape(text)

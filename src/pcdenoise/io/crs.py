@@ -6,36 +6,64 @@ without a name or unit stays a code: looking it up needs the EPSG register, whic
 
 from __future__ import annotations
 
+import math
 import re
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 WKT, GEO_KEYS, GEO_TEXT = 2112, 34735, 34737
 """Record numbers of user LASF_Projection: text, GeoTIFF directory, GeoTIFF strings."""
 
+PROJECTED, GEOGRAPHIC, GEOCENTRIC = "projected", "geographic", "geocentric"
+"""Kinds of systems: a map's plane; longitude and latitude; x, y, z from the middle of the Earth."""
+
+_MOST_DEGREES = (360.0, 90.0)
+_EARTH_M = (6.2e6, 6.6e6)  # from its middle to the deepest and highest places that anybody scans, airborne included
+
 _UNITS = {9001: "metre", 9002: "foot", 9003: "US survey foot", 9101: "radian", 9102: "degree"}
 _FACTORS = {1.0: "metre", 0.3048: "foot", 0.304800609601219: "US survey foot", 0.017453292519943: "degree"}
 _TOKEN = re.compile(r'"(?:[^"]|"")*"|[\[\](),]|[^\[\](),"\s]+')
-_HORIZONTAL = {"PROJCS", "PROJCRS", "PROJECTEDCRS", "GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "GEODCRS", "GEOCCS"}
+_KINDS = {
+    **dict.fromkeys(("PROJCS", "PROJCRS", "PROJECTEDCRS"), PROJECTED),
+    **dict.fromkeys(("GEOGCS", "GEOGCRS", "GEOGRAPHICCRS"), GEOGRAPHIC),
+    "GEOCCS": GEOCENTRIC,
+    "GEODCRS": "",  # geographic or geocentric, as its axes have it
+}
 _VERTICAL = {"VERT_CS", "VERTCRS", "VERTICALCRS"}
 _UNIT = {"UNIT", "LENGTHUNIT", "ANGLEUNIT"}
 _MOST_TOKENS = 20_000
-_PROJECTED, _GEOGRAPHIC, _GEOCENTRIC = 1, 2, 3
+_KIND_KEYS = {1: PROJECTED, 2: GEOGRAPHIC, 3: GEOCENTRIC}
 _USER_DEFINED = 32767
 
 
 @dataclass(frozen=True)
 class Crs:
-    """Names and units as the file gives them, empty where it does not; a code is 'EPSG:32617'."""
+    """Names, kind and units as the file gives them, empty where it does not; a code is 'EPSG:32617'."""
 
     name: str = ""
     unit: str = ""
     vertical_name: str = ""
     vertical_unit: str = ""
+    kind: str = ""
+
+    def misfit(self, low: Sequence[float], high: Sequence[float]) -> str:
+        """Why coordinates between two corners cannot be of this system, in a clause; empty if they may be."""
+        far = [max(abs(a), abs(b)) for a, b in zip(low, high, strict=True)]
+        if self.unit == "degree":
+            beyond = [axis for axis in (0, 1) if far[axis] > _MOST_DEGREES[axis]]
+            return f"says degrees, but {'xy'[beyond[0]]} reaches {far[beyond[0]]:,.0f}" if beyond else ""
+        if self.kind == GEOCENTRIC and self.unit == "metre":
+            nearest = math.hypot(*(0.0 if a < 0 < b else min(abs(a), abs(b)) for a, b in zip(low, high, strict=True)))
+            if math.hypot(*far) < _EARTH_M[0]:
+                return f"says metres from the middle of the Earth, but {math.hypot(*far) / 1000:,.0f} km from it is underground"
+            if nearest > _EARTH_M[1]:
+                return f"says metres from the middle of the Earth, but {nearest / 1000:,.0f} km from it is space"
+        return ""
 
     def __str__(self) -> str:
-        parts = [self.name or "unnamed", self.unit, f"heights {self.vertical_name}" if self.vertical_name else ""]
+        kind = self.kind if self.kind == GEOCENTRIC else ""
+        parts = [self.name or "unnamed", kind, self.unit, f"heights {self.vertical_name}" if self.vertical_name else ""]
         parts.append(f"heights in {self.vertical_unit}" if self.vertical_unit not in ("", self.unit) else "")
         return ", ".join(part for part in parts if part)
 
@@ -93,11 +121,12 @@ def _from_text(text: str) -> Crs | None:
         elif token != ",":
             path[-1].values.append(token.strip('"'))
     systems = [node for top in root.children for node in (top, *top.children)]
-    horizontal = next((node for node in systems if node.keyword in _HORIZONTAL), None)
+    horizontal = next((node for node in systems if node.keyword in _KINDS), None)
     vertical = next((node for node in systems if node.keyword in _VERTICAL), None)
     if horizontal is None:
         return None
-    return Crs(horizontal.name, horizontal.unit, vertical.name if vertical else "", vertical.unit if vertical else "")
+    kind = _KINDS[horizontal.keyword] or (GEOGRAPHIC if horizontal.unit == "degree" else GEOCENTRIC)
+    return Crs(horizontal.name, horizontal.unit, vertical.name if vertical else "", vertical.unit if vertical else "", kind)
 
 
 def _from_keys(directory: bytes, text: bytes) -> Crs | None:
@@ -111,12 +140,12 @@ def _from_keys(directory: bytes, text: bytes) -> Crs | None:
             values[key] = value
         elif where == GEO_TEXT:
             texts[key] = text[value : value + count].decode("latin-1").strip("\0|")
-    kind = values.get(1024)
-    code = values.get(3072 if kind == _PROJECTED else 2048, 0)
-    citation = texts.get(3073 if kind == _PROJECTED else 2049) or texts.get(1026, "")
+    kind = _KIND_KEYS.get(values.get(1024, 0), "")
+    code = values.get(3072 if kind == PROJECTED else 2048, 0)
+    citation = texts.get(3073 if kind == PROJECTED else 2049) or texts.get(1026, "")
     vertical_code = values.get(4096, 0)
     name = citation or (f"EPSG:{code}" if 0 < code < _USER_DEFINED else "")
-    unit = "degree" if kind == _GEOGRAPHIC else "metre" if kind == _GEOCENTRIC else _UNITS.get(values.get(3076, 0), "")
+    unit = "degree" if kind == GEOGRAPHIC else "metre" if kind == GEOCENTRIC else _UNITS.get(values.get(3076, 0), "")
     vertical = texts.get(4097) or (f"EPSG:{vertical_code}" if 0 < vertical_code < _USER_DEFINED else "")
-    found = Crs(name, unit, vertical, _UNITS.get(values.get(4099, 0), ""))
+    found = Crs(name, unit, vertical, _UNITS.get(values.get(4099, 0), ""), kind)
     return found if found != Crs() else None
