@@ -138,7 +138,7 @@ def _save_report(path: Path, scan: Scan, passes: list[_Pass], settings: dict[str
         for name in names
     ]
     steps = {f"Pass {number}": passes[number].points for number in numbers[1:-1]}
-    rows = [{"pass": number, **passes[number].figures} for number in numbers]
+    rows = [{"pass": number, **passes[number].figures} for number in numbers if passes[number].figures]
     page = Page(scan.points, last.points, steps=steps, colours=outputs.colours(scan), charts=charts, tables={"Passes": rows})
     files = [{"input": scan.origin, "status": "done", "figures": {"passes": len(passes) - 1, **last.figures}}]
     outputs.save_report(path, "iterate", settings, files, page, overwrite=overwrite)

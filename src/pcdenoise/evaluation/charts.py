@@ -22,7 +22,7 @@ _INKS = {
     "series3": (0.50, 0.36, 0.62),
 }
 Scale = Callable[[float], float]
-_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 22, 62, 50
+_LEFT, _RIGHT, _TOP, _BOTTOM = 76, 22, 62, 50
 
 
 @dataclass(frozen=True)
