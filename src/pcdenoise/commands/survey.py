@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 N_NEIGHBOURS = 16
 """Nearest points whose disc gives the density."""
 
-PASS_CPU_S_PER_POINT = 90e-6
+PASS_CPU_S_PER_POINT = 45e-6
 """CPU seconds that one pass of the shipped model takes for a point; to be set anew when the pass becomes faster."""
 START_CPU_S, START_BYTES, BYTES_PER_POINT = 5.0, 0.36e9, 950
 """What a run costs beside that: a line through what `/usr/bin/time -v pcdenoise denoise` says of 42K and 519K points."""

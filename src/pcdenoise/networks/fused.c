@@ -296,7 +296,8 @@ INLINE void step(const Head *head, const Neighbourhood *near, const Edges *edge,
             for (int c = 0; c < CHANNELS; c++) sum += head->weight[h][c] * messages[j][c];
             known[h] = sum + head->bias[h];
         }
-        const float weight = near->weight[j] * expf(4 * tanhf(known[0] / 4));
+        const float bounded = 1 - 2 / (expf(known[0] / 2) + 1); /* tanh of a quarter */
+        const float weight = near->weight[j] * expf(4 * bounded);
         const float pull = weight * (0.5f + known[1]) * edge->b[j];
         total += weight;
         x += pull * edge->nx[j], y += pull * edge->ny[j], z += pull * edge->nz[j];
