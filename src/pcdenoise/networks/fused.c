@@ -86,6 +86,13 @@ INLINE Channels layer(Channels sum, const float *input, int n, const float *weig
     return sum;
 }
 
+/* exp(-x) for 0 <= x <= 1 / KERNEL_SHARE² to float32's rounding, without a call, so that a loop of it runs in lanes. */
+INLINE float falling_exponential(float x) {
+    const float t = x * -0.25f;
+    const float root = 1 + t * (1 + t * (1 / 2.f + t * (1 / 6.f + t * (1 / 24.f + t * (1 / 120.f + t * (1 / 720.f + t / 5040))))));
+    return (root * root) * (root * root);
+}
+
 INLINE void neighbourhood(Neighbourhood *near, const double *point, const double *sources, const int32_t *index,
                           const float *count, int k) {
     near->k = k;
@@ -105,7 +112,7 @@ INLINE void neighbourhood(Neighbourhood *near, const double *point, const double
         near->x[j] *= unit, near->y[j] *= unit, near->z[j] *= unit;
         const float squared = near->x[j] * near->x[j] + near->y[j] * near->y[j] + near->z[j] * near->z[j];
         const float falling = larger(1 - KERNEL_SHARE * KERNEL_SHARE * squared, 0);
-        near->weight[j] = expf(-squared) * falling * falling * (count ? count[index[j]] : 1);
+        near->weight[j] = falling_exponential(squared) * falling * falling * (count ? count[index[j]] : 1);
         sum += near->weight[j];
     }
     for (int j = 0; j < k; j++) near->weight[j] /= larger(sum, 1e-12f);
