@@ -24,11 +24,6 @@
 #else
 #define ANY_PROCESSOR
 #endif
-#if defined(_WIN32)
-#define EXPORT __declspec(dllexport)
-#else
-#define EXPORT __attribute__((visibility("default")))
-#endif
 #define INLINE static inline __attribute__((always_inline))
 
 typedef float Lanes __attribute__((vector_size(LANES * sizeof(float)), aligned(4), may_alias));
@@ -192,7 +187,7 @@ INLINE void plane(const Neighbourhood *near, float *normal, float *shape) {
 }
 
 /* Planes and first features of the points in rows [start, stop). */
-EXPORT ANY_PROCESSOR void look(const double *points, const double *sources, const int32_t *index, const float *count,
+static ANY_PROCESSOR void look(const double *points, const double *sources, const int32_t *index, const float *count,
                                int k, float noise, int64_t start, int64_t stop, const Embedding *embedding,
                                float *normals, float *shapes, float *features) {
     Neighbourhood near;
@@ -319,7 +314,7 @@ INLINE void step(const Head *head, const Neighbourhood *near, const Edges *edge,
 /* Rounds of messages of the points in rows [start, stop), and their step where there is a head.
 
    `heard` holds what the sources say in each round, one array after the other, `n_heard` floats each. */
-EXPORT ANY_PROCESSOR void talk(const double *points, const double *sources, const int32_t *index, const float *count,
+static ANY_PROCESSOR void talk(const double *points, const double *sources, const int32_t *index, const float *count,
                                int k, float noise, int64_t start, int64_t stop, const float *normals, const float *their_normals,
                                const Round *rounds, int n_rounds, const float *heard, int64_t n_heard,
                                const float *before, float *features, const Head *head, float *moves) {
@@ -338,7 +333,49 @@ EXPORT ANY_PROCESSOR void talk(const double *points, const double *sources, cons
     }
 }
 
-/* Nothing is called by Python itself: fused.py takes the two functions above from the library. */
-static struct PyModuleDef module = {PyModuleDef_HEAD_INIT, "_fused", NULL, -1, NULL, NULL, NULL, NULL, NULL};
+/* For Python, which gives arrays by their addresses (fused.py) and lets other threads go on meanwhile. */
+
+#define AT(type, address) ((type *)(uintptr_t)(address))
+
+static PyObject *call_look(PyObject *self, PyObject *args) {
+    unsigned long long points, sources, index, count, embedding, normals, shapes, features;
+    long long start, stop;
+    float noise;
+    int k;
+    (void)self;
+    if (!PyArg_ParseTuple(args, "KKKKifLLKKKK", &points, &sources, &index, &count, &k, &noise, &start, &stop, &embedding, &normals,
+                          &shapes, &features))
+        return NULL;
+    Py_BEGIN_ALLOW_THREADS
+    look(AT(double, points), AT(double, sources), AT(int32_t, index), AT(float, count), k, noise, start, stop,
+         AT(Embedding, embedding), AT(float, normals), AT(float, shapes), AT(float, features));
+    Py_END_ALLOW_THREADS
+    Py_RETURN_NONE;
+}
+
+static PyObject *call_talk(PyObject *self, PyObject *args) {
+    unsigned long long points, sources, index, count, normals, their_normals, rounds, heard, before, features, head, moves;
+    long long start, stop, n_heard;
+    float noise;
+    int k, n_rounds;
+    (void)self;
+    if (!PyArg_ParseTuple(args, "KKKKifLLKKKiKLKKKK", &points, &sources, &index, &count, &k, &noise, &start, &stop, &normals,
+                          &their_normals, &rounds, &n_rounds, &heard, &n_heard, &before, &features, &head, &moves))
+        return NULL;
+    Py_BEGIN_ALLOW_THREADS
+    talk(AT(double, points), AT(double, sources), AT(int32_t, index), AT(float, count), k, noise, start, stop, AT(float, normals),
+         AT(float, their_normals), AT(Round, rounds), n_rounds, AT(float, heard), n_heard, AT(float, before), AT(float, features),
+         AT(Head, head), AT(float, moves));
+    Py_END_ALLOW_THREADS
+    Py_RETURN_NONE;
+}
+
+static PyMethodDef functions[] = {
+    {"look", call_look, METH_VARARGS, "Planes and first features of some points."},
+    {"talk", call_talk, METH_VARARGS, "Rounds of messages of some points, and their step."},
+    {NULL, NULL, 0, NULL},
+};
+
+static struct PyModuleDef module = {PyModuleDef_HEAD_INIT, "_fused", NULL, -1, functions, NULL, NULL, NULL, NULL};
 
 PyMODINIT_FUNC PyInit__fused(void) { return PyModule_Create(&module); }

@@ -6,21 +6,23 @@ float32's rounding. Not here: the arithmetic (fused.c), neighbour search, blocks
 
 from __future__ import annotations
 
-import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
-from importlib.util import find_spec
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from pcdenoise.networks.projection import Planes, ProjectionNetwork, Stage
 
+try:
+    from pcdenoise.networks import _fused
+except ImportError:
+    IS_BUILT = False
+else:
+    IS_BUILT = True
+
 CHANNELS, MOST_NEIGHBOURS = 32, 64
 """What the compiled code is made for."""
-_Integer, _Real, _Address = ctypes.c_int64, ctypes.c_float, ctypes.c_void_p
 
 
 @dataclass(frozen=True)
@@ -34,38 +36,20 @@ class Surroundings:
     noise: float
 
 
-@lru_cache(maxsize=1)
-def library() -> ctypes.CDLL | None:
-    """The library, whose calls leave the interpreter to other threads; None where it was not built or is another system's."""
-    found = find_spec("pcdenoise.networks._fused")
-    if found is None or found.origin is None:
-        return None
-    try:
-        compiled = ctypes.CDLL(found.origin)
-    except OSError:
-        return None
-    around: list[Any] = [*[_Address] * 4, ctypes.c_int, _Real, _Integer, _Integer]
-    compiled.look.argtypes = [*around, *[_Address] * 4]
-    compiled.talk.argtypes = [*around, *[_Address] * 3, ctypes.c_int, _Address, _Integer, *[_Address] * 4]
-    compiled.look.restype = compiled.talk.restype = None
-    return compiled
-
-
 def runs(network: ProjectionNetwork) -> bool:
     """Whether the compiled code can run this network now: nobody learns, and it has the sizes that the code is made for."""
     sizes = network.config
     fits = sizes.channels == CHANNELS and sizes.neighbours <= MOST_NEIGHBOURS
-    return fits and not torch.is_grad_enabled() and next(network.parameters()).dtype == torch.float32 and library() is not None
+    return fits and not torch.is_grad_enabled() and next(network.parameters()).dtype == torch.float32 and IS_BUILT
 
 
 def looking(around: Surroundings, stage: Stage | None, planes: Planes, features: Tensor) -> Callable[[slice], None]:
     """A function that writes some rows' tangent planes and, for a stage, first features (M, C); threads may share it."""
     embedding = None if stage is None else _packed(stage.embed)
-    compiled, given = library(), _given(around)
-    assert compiled is not None
+    given = _given(around)
 
     def look(rows: slice) -> None:
-        compiled.look(*given, rows.start, rows.stop, _at(embedding), _at(planes.normal), _at(planes.shape), _at(features))
+        _fused.look(*given, rows.start, rows.stop, _at(embedding), _at(planes.normal), _at(planes.shape), _at(features))
 
     return look
 
@@ -89,12 +73,11 @@ def talking(
     parts = [part for layer in layers for part in (layer.edge, layer.own, layer.message, layer.update, layer.norm)]
     weights = torch.cat([_packed(part) for part in parts])
     head = None if moves is None else torch.cat([stage.step.head.weight.flatten(), stage.step.head.bias])
-    compiled, given = library(), _given(around)
-    assert compiled is not None
+    given = _given(around)
 
     def talk(rows: slice) -> None:
-        compiled.talk(
-            *given, rows.start, rows.stop, *map(_at, normals), _at(weights), len(layers), _at(heard), heard[0].numel(),
+        _fused.talk(
+            *given, rows.start, rows.stop, _at(normals[0]), _at(normals[1]), _at(weights), len(layers), _at(heard), heard[0].numel(),
             _at(before), _at(features), _at(head), _at(moves),
         )  # fmt: skip
 
@@ -106,14 +89,14 @@ def _packed(layer: nn.Module) -> Tensor:
     return torch.cat([parameter.detach().t().flatten() for parameter in layer.parameters()])
 
 
-def _given(around: Surroundings) -> Sequence[int | float | None]:
-    arrays = (around.points, around.sources, around.index, around.count)
-    return *map(_at, arrays), around.index.shape[1], around.noise
+def _given(around: Surroundings) -> tuple[int, int, int, int, int, float]:
+    points, sources, index, count = map(_at, (around.points, around.sources, around.index, around.count))
+    return points, sources, index, count, around.index.shape[1], around.noise
 
 
-def _at(values: Tensor | None) -> int | None:
-    """Where dense values lie."""
+def _at(values: Tensor | None) -> int:
+    """The address of dense values, 0 for none."""
     if values is None:
-        return None
+        return 0
     assert values.is_contiguous()
     return values.data_ptr()

@@ -1,0 +1,38 @@
+"""What fused.c gives to Python; arrays are addresses, 0 for none."""
+
+def look(
+    points: int,
+    sources: int,
+    index: int,
+    count: int,
+    k: int,
+    noise: float,
+    start: int,
+    stop: int,
+    embedding: int,
+    normals: int,
+    shapes: int,
+    features: int,
+    /,
+) -> None: ...
+def talk(
+    points: int,
+    sources: int,
+    index: int,
+    count: int,
+    k: int,
+    noise: float,
+    start: int,
+    stop: int,
+    normals: int,
+    their_normals: int,
+    rounds: int,
+    n_rounds: int,
+    heard: int,
+    n_heard: int,
+    before: int,
+    features: int,
+    head: int,
+    moves: int,
+    /,
+) -> None: ...
