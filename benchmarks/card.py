@@ -24,7 +24,7 @@ files on the same kind of machine; the classical ones had their parameters tuned
 shapes, their number and our score on them stand in brackets. CPU s: the whole process per cloud, start-up included.
 
 ```text
-python score.py --run "pcdenoise denoise {{input}} -o {{output}} --overwrite" --json scores.json
+python score.py --run "pcdenoise denoise {{input}} -o {{output}}{option} --overwrite" --json scores.json
 ```
 """
 
@@ -58,7 +58,9 @@ def main() -> None:
     rows, folder = json.loads(Path(sys.argv[1]).read_text()), Path(sys.argv[2])
     card, config_path = folder / "README.md", folder / "config.json"
     text = card.read_text().split(HEADING)[0].rstrip()
-    card.write_text(f"{text}\n\n{HEADING}\n\n{EXPLANATION.format(n_shapes=len(rows[0]['shapes']))}\n{table(rows)}\n")
+    option = "" if folder.name == "default" else f" --model {folder.name}"
+    explanation = EXPLANATION.format(n_shapes=len(rows[0]["shapes"]), option=option)
+    card.write_text(f"{text}\n\n{HEADING}\n\n{explanation}\n{table(rows)}\n")
     config = json.loads(config_path.read_text())
     config["scores"] = {f"{row['n']}_{row['level']}": {key: round(row[key], 3) for key in ("cd", "p2s", "td")} for row in rows}
     config_path.write_text(json.dumps(config, indent=1) + "\n")

@@ -77,8 +77,8 @@ def talking(
 
     def talk(rows: slice) -> None:
         _fused.talk(
-            *given, rows.start, rows.stop, _at(normals[0]), _at(normals[1]), _at(weights), len(layers), _at(heard), heard[0].numel(),
-            _at(before), _at(features), _at(head), _at(moves),
+            *given, rows.start, rows.stop, _at(normals[0]), _at(normals[1]),
+            _at(weights), len(layers), _at(heard), heard[0].numel(), _at(before), _at(features), _at(head), _at(moves),
         )  # fmt: skip
 
     return talk
