@@ -17,8 +17,8 @@ demo: .venv/run.stamp ## clean the shipped scan with the shipped model and show 
 		--picture demo/before_after.png --report demo/report.html
 	@echo "Look at demo/before_after.png, open demo/report.html in a browser; the clean scan is demo/ground_clean.laz."
 
-test: .venv/dev.stamp ## all tests
-	$(BIN)/python -m pytest
+test: .venv/dev.stamp ## all tests, two at a time
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 lint: .venv/dev.stamp ## ruff (style and bugs) and import-linter (the layers)
 	$(BIN)/ruff check .
