@@ -2,6 +2,7 @@
 PYTHON ?= python3
 PIP := .venv/bin/python -m pip --disable-pip-version-check
 BIN := .venv/bin
+COMPILED := src/pcdenoise/networks/fused.c
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test lint types docs site bench clean
@@ -46,15 +47,15 @@ bench: .venv/run.stamp ## the shipped model and a classical filter on shapes who
 clean: ## remove .venv and what demo and bench wrote
 	rm -rf .venv demo build
 
-# A stamp is as new as the last set-up; pip runs again when the dependencies change.
+# A stamp is as new as the last set-up; pip runs again when the dependencies or what it compiles change.
 .venv/bin/python:
 	@echo "Setting up .venv; the first time takes a minute or two."
 	$(PYTHON) -m venv .venv
 
-.venv/run.stamp: .venv/bin/python pyproject.toml constraints.txt
+.venv/run.stamp: .venv/bin/python pyproject.toml constraints.txt $(COMPILED)
 	$(PIP) install -q -c constraints.txt -e .
 	@touch $@
 
-.venv/dev.stamp: .venv/bin/python pyproject.toml constraints.txt
+.venv/dev.stamp: .venv/bin/python pyproject.toml constraints.txt $(COMPILED)
 	$(PIP) install -q -c constraints.txt -e '.[dev]'
 	@touch $@ .venv/run.stamp

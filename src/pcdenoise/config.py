@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidatorFunctionWrapHandler, field_validator
 
 Method = Literal["network", "mean", "bilateral", "jet"]
 
@@ -42,6 +42,14 @@ class DenoiseConfig(Settings):
     sigma_n: float | None = Field(None, gt=0, description="How fast its weights fall with height, likewise.")
     seed: int = Field(0, ge=0, description="Seed of every random choice.")
     threads: int | None = Field(None, ge=1, description="Processor threads; all of them by default.")
+
+    @field_validator("iters", mode="wrap")
+    @classmethod
+    def _passes_or_auto(cls, value: Any, validated: ValidatorFunctionWrapHandler) -> Any:
+        try:
+            return validated(value)
+        except ValidationError:
+            raise ValueError("must be a number of passes from 1 to 100, or auto") from None
 
 
 class TrainConfig(Settings):

@@ -155,8 +155,9 @@ def denoise(
     for job in done if resume else jobs:
         shutil.rmtree(_cells_of(job), ignore_errors=True)
     chosen = selection.Selection.of(only_class, context, roi)
+    refuse_model(model, settings)
     cleaning = _Cleaning(
-        settings, chosen, refuse_model(model, settings), console, format, overwrite or is_far, drop_attributes, displacement,
+        settings, chosen, model, console, format, overwrite or is_far, drop_attributes, displacement,
         max_drift, pictures, n_bytes(max_memory) // workers, tile, colour,
     )  # fmt: skip
     if len(jobs) > 1 or is_far:
@@ -179,11 +180,10 @@ def chosen_model(name: str | None, settings: DenoiseConfig) -> Model | None:
     return store.load(name) if name else store.load()
 
 
-def refuse_model(name: str | None, settings: DenoiseConfig) -> str | None:
-    """The name as it is. Raises UsageError where a model is named that no one would use."""
+def refuse_model(name: str | None, settings: DenoiseConfig) -> None:
+    """Raises UsageError where a model is named that no one would use."""
     if settings.method != "network" and name is not None:
         raise UsageError(f"--model {name}: --method {settings.method} uses no model; leave one of the two out")
-    return name
 
 
 def _cells_of(job: Job) -> Path:
@@ -330,12 +330,12 @@ class _Cleaning:
             drop_attributes=self.drop_attributes, provenance=outputs.provenance("denoise", self.settings),
         )  # fmt: skip
         figures = {"points": len(scan), **result.figures, "seconds": round(time.perf_counter() - started, 3)}
+        unit = unit_of(scan)
         if picture := self.pictures.get(job.source):
-            unit = unit_of(scan)
             outputs.save_before_after(
                 picture, scan, result.points, notes=picture_notes(result, unit), unit=unit, overwrite=self.overwrite
             )
-        self.pages[:] = [Page(scan.points, result.points, colours=outputs.colours(scan), unit=unit_of(scan))]
+        self.pages[:] = [Page(scan.points, result.points, colours=outputs.colours(scan), unit=unit)]
         for text in traps(scan, figures["noise"] if figures["is_surface"] else None):
             self.console.note(f"{job.source}: {text}")
         self.console.note(f"{job.target}: {_summary(figures)}" + (f"; picture {picture}" if picture else ""))

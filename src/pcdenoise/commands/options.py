@@ -97,12 +97,9 @@ def configured(model: type[ConfigModel], **values: Any) -> ConfigModel:
     except ValidationError as error:
         first = error.errors()[0]
         name = _flag(str(first["loc"][0])) if first["loc"] else "options"
-        message = (
-            first["msg"].removeprefix("Value error, ").replace("input should be", "must be").replace("Input should be", "must be")
-        )
-        if first["loc"][:1] == ("iters",):
-            message = "must be a number of passes from 1 to 100, or auto"
-        raise UsageError(f"{name}: {message[0].lower()}{message[1:]}, got {first['input']!r}") from None
+        message = first["msg"].removeprefix("Value error, ")
+        message = f"{message[0].lower()}{message[1:]}".replace("input should be", "must be")
+        raise UsageError(f"{name}: {message}, got {first['input']!r}") from None
 
 
 def _suffix_known(option_name: str, suffixes: tuple[str, ...], what: str) -> Callable[[Any], Any]:

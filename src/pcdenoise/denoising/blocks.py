@@ -23,9 +23,8 @@ def each_block(work: Callable[[slice], None], n: int, threads: int, block_points
     A block's work is done by one thread, since threads that wait for each other after every small operation cost more than
     they do.
     """
-    blocks = [slice(i, min(i + block_points, n)) for i in range(0, n, block_points)]
     with ThreadPoolExecutor(threads if threads > 0 else os.cpu_count()) as pool:
-        for _ in pool.map(work, blocks):
+        for _ in pool.map(work, _blocks(n, block_points)):
             pass
 
 
@@ -34,7 +33,7 @@ def in_blocks(work: Work, n: int, threads: int, block_points: int = BLOCK_POINTS
 
     Without gradients every result goes to its place at once, so that nothing but the results outlives its block.
     """
-    blocks = [slice(i, min(i + block_points, n)) for i in range(0, n, block_points)]
+    blocks = _blocks(n, block_points)
     if len(blocks) == 1:
         return work(blocks[0])
     with_gradient = torch.is_grad_enabled()  # known to this thread alone
@@ -53,6 +52,10 @@ def in_blocks(work: Work, n: int, threads: int, block_points: int = BLOCK_POINTS
 
     each_block(one, n, threads, block_points)
     return whole
+
+
+def _blocks(n: int, block_points: int) -> list[slice]:
+    return [slice(i, min(i + block_points, n)) for i in range(0, n, block_points)]
 
 
 @contextmanager

@@ -126,30 +126,36 @@ def descend(
     Points stay float64 and only differences between neighbours become float32. The result does not depend on `block_points`.
     Raises ModelError when a stage gives positions that are not numbers.
     """
-    k, kind = network.config.neighbours, _Fused if fused.runs(network) else _Looking
-    points = torch.from_numpy(seeds)
+    points = torch.from_numpy(np.ascontiguousarray(seeds))
     weights = None if count is None else torch.from_numpy(count.astype(np.float32))
+    kind = _Fused if fused.runs(network) else _Looking
+
+    def neighbours(points: Tensor, sources: Tensor) -> Tensor:
+        search = NeighbourSearch(sources.detach().numpy(), threads)
+        return torch.from_numpy(search.nearest(points.detach().numpy(), network.config.neighbours))
+
+    def looking(points: Tensor, sources: Tensor, index: Tensor) -> _Looking | _Fused:
+        return kind(fused.Surroundings(points, sources, index, weights, noise), block_points, threads)
+
     features: Tensor | None = None
     stages: list[Tensor] = []
     surface = torch.ones(0)
-    known_neighbours: Tensor | None = None  # points that are their own seeds hardly move: they keep their neighbours
+    index: Tensor | None = None
     for stage in network.among:
-        looking = kind(points, points, weights, k, noise, block_points, threads, known_neighbours)
-        if raw is None:
-            known_neighbours = looking.index
-        own, known = looking.around(stage)
+        if index is None or raw is not None:  # points that are their own seeds hardly move: they keep their neighbours
+            index = neighbours(points, points)
+        among = looking(points, points, index)
+        own, known = among.around(stage)
         surface = surface if stages else trust(own, noise)
         features = known if features is None else features + known
-        move, features = looking.messages(stage, own, features, on_block)
+        move, features = among.messages(stage, own, features, on_block)
         points = _numbers(points + move.double())
         stages.append(points)
     if raw is None or features is None:
         return Descent(stages, surface, None)
-    seed_planes = kind(points, points, weights, k, noise, block_points, threads).planes()
-    landing = torch.from_numpy(raw)
-    move = kind(landing, points, weights, k, noise, block_points, threads).landing(
-        network.landing, seed_planes, features, on_block
-    )
+    seed_planes = looking(points, points, neighbours(points, points)).planes()
+    landing = torch.from_numpy(np.ascontiguousarray(raw))
+    move = looking(landing, points, neighbours(landing, points)).landing(network.landing, seed_planes, features, on_block)
     return Descent(stages, surface, _numbers(landing + move.double()))
 
 
@@ -160,38 +166,28 @@ def _numbers(points: Tensor) -> Tensor:
     return points
 
 
-def _nearest(points: Tensor, sources: Tensor, k: int, threads: int) -> Tensor:
-    """(M, K) int32 rows of the sources nearest to each point."""
-    return torch.from_numpy(NeighbourSearch(sources.detach().numpy(), threads).nearest(points.detach().numpy(), k))
-
-
 class _Looking:
     """M points that look at their nearest sources, block by block; with a single block nothing is computed twice."""
 
-    def __init__(
-        self, points: Tensor, sources: Tensor, count: Tensor | None, k: int, noise: float, block_points: int, threads: int,
-        index: Tensor | None = None,
-    ) -> None:  # fmt: skip
-        self.points, self.sources, self.count, self.noise = points, sources, count, noise
-        self.block_points, self.threads = block_points, threads
-        self.index = _nearest(points, sources, k, threads) if index is None else index
+    def __init__(self, here: fused.Surroundings, block_points: int, threads: int) -> None:
+        self.here, self.block_points, self.threads = here, block_points, threads
         self._only: Edges | None = None
         self._only_features: tuple[Tensor, Tensor, Tensor] | None = None
 
     def over_blocks(self, work: Callable[[slice, Edges], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
         """What `work` gives for each block and its edges, put together."""
-        return in_blocks(lambda block: work(block, self._edges(block)), len(self.points), self.threads, self.block_points)
+        return in_blocks(lambda block: work(block, self._edges(block)), len(self.here.points), self.threads, self.block_points)
 
     @property
     def in_one(self) -> bool:
         """Whether all points are one block, whose edges are kept."""
-        return len(self.points) <= self.block_points
+        return len(self.here.points) <= self.block_points
 
     def _edges(self, block: slice) -> Edges:
         if self._only is not None:
             return self._only
-        index = self.index[block]
-        graph = edges((at(self.sources, index) - self.points[block, None]).float(), index, self.count)
+        index = self.here.index[block]
+        graph = edges((at(self.here.sources, index) - self.here.points[block, None]).float(), index, self.here.count)
         if self.in_one:
             self._only = graph
         return graph
@@ -205,7 +201,7 @@ class _Looking:
 
         def look(_: slice, graph: Edges) -> tuple[Tensor, ...]:
             plane = planes(graph)
-            return *plane, stage.embed(point_features(graph, plane, self.noise))
+            return *plane, stage.embed(point_features(graph, plane, self.here.noise))
 
         normal, shape, known = self.over_blocks(look)
         return Planes(normal, shape), known
@@ -235,8 +231,8 @@ class _Looking:
 
         def land(block: slice, graph: Edges) -> tuple[Tensor]:
             mine = planes(graph)
-            features = stage.embed(point_features(graph, mine, self.noise))
-            edge, a, b = edge_features(graph, mine, theirs, self.noise)
+            features = stage.embed(point_features(graph, mine, self.here.noise))
+            edge, a, b = edge_features(graph, mine, theirs, self.here.noise)
             for layer, said in zip(stage.exchanges, heard, strict=True):
                 message, features = layer(edge, graph, features, said)
                 on_block(block.stop - block.start)
@@ -246,22 +242,17 @@ class _Looking:
 
     def _features(self, graph: Edges, mine: Planes, theirs: Planes) -> tuple[Tensor, Tensor, Tensor]:
         if not self.in_one:
-            return edge_features(graph, mine, theirs, self.noise)
+            return edge_features(graph, mine, theirs, self.here.noise)
         if self._only_features is None:
-            self._only_features = edge_features(graph, mine, theirs, self.noise)
+            self._only_features = edge_features(graph, mine, theirs, self.here.noise)
         return self._only_features
 
 
 class _Fused:
-    """What `_Looking` does, in compiled code: no edge is ever written to memory, so blocks are large."""
+    """What `_Looking` does, in compiled code: no edge is ever written to memory."""
 
-    def __init__(
-        self, points: Tensor, sources: Tensor, count: Tensor | None, k: int, noise: float, block_points: int, threads: int,
-        index: Tensor | None = None,
-    ) -> None:  # fmt: skip
-        self.index = _nearest(points, sources, k, threads) if index is None else index
-        self.around_us = fused.Surroundings(points.contiguous(), sources.contiguous(), self.index, count, noise)
-        self.block_points, self.threads = block_points, threads
+    def __init__(self, here: fused.Surroundings, block_points: int, threads: int) -> None:
+        self.here, self.block_points, self.threads = here, block_points, threads
 
     def planes(self) -> Planes:
         """Tangent planes of all points."""
@@ -290,9 +281,9 @@ class _Fused:
         return moves
 
     def _seen(self, stage: Stage | None) -> tuple[Planes, Tensor]:
-        n = len(self.around_us.points)
+        n = len(self.here.points)
         planes, features = Planes(torch.empty(n, 3), torch.empty(n, 3)), torch.empty(n if stage else 0, fused.CHANNELS)
-        look = fused.looking(self.around_us, stage, planes, features)
+        look = fused.looking(self.here, stage, planes, features)
         each_block(look, n, self.threads, self.block_points)
         return planes, features
 
@@ -301,7 +292,7 @@ class _Fused:
         moves: Tensor | None, on_block: Callable[[int], None],
     ) -> Tensor:  # fmt: skip
         features = torch.empty_like(before)
-        talk = fused.talking(self.around_us, stage, rounds, (mine.normal, theirs.normal), heard, before, features, moves)
+        talk = fused.talking(self.here, stage, rounds, (mine.normal, theirs.normal), heard, before, features, moves)
 
         def told(block: slice) -> None:
             talk(block)

@@ -39,6 +39,7 @@ from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import classical, denoiser, held_out, outliers, uncertainty
 from pcdenoise.denoising.denoiser import Identity, Progress
 from pcdenoise.networks.store import Model
+from pcdenoise.whole_files import replaced
 
 BASE_BYTES, POINT_BYTES = 400 << 20, 1100
 """Memory of the program itself, and of each point of the part that is being cleaned (measured, with a tenth to spare)."""
@@ -484,12 +485,8 @@ def _joined(parts: list[_Part]) -> _Part:
 def _write(path: Path, data: bytes) -> None:
     """A file that is there whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
-    with part.open("wb") as file:
+    with replaced(path) as file:
         file.write(data)
-        file.flush()
-        os.fsync(file.fileno())  # so that after a power cut, too, a file that is there is whole
-    os.replace(part, path)
 
 
 Cuts = list[Any]

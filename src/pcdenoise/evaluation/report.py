@@ -22,7 +22,6 @@ import json
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from html import escape
 from importlib import resources
@@ -124,7 +123,7 @@ def write_csv(path: str | PathLike[str], rows: Iterable[Mapping[str, Any]], *, o
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, restval="", lineterminator="\r\n")
     writer.writeheader()
-    writer.writerows(flat)
+    writer.writerows({key: json.dumps(value) if isinstance(value, list) else value for key, value in row.items()} for row in flat)
     _write(path, text.getvalue(), overwrite)
 
 
@@ -194,7 +193,7 @@ def _flat(row: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         if isinstance(value, Mapping):
             flat.update(_flat(value, f"{prefix}{key}."))
         else:
-            flat[prefix + key] = "" if value is None else json.dumps(value) if isinstance(value, list) else value
+            flat[prefix + key] = value
     return flat
 
 
@@ -277,10 +276,6 @@ def _cell(value: Any) -> str:
         return "yes" if value else "no"
     if value in (None, ""):
         return "\u2013"
-    if _is_number(value):
-        return short(value)
-    text = str(value)
-    if text.startswith("[") and text.endswith("]"):  # a list, as `_flat` left it
-        with suppress(ValueError):
-            text = ", ".join(item if isinstance(item, str) else f"{item:g}" for item in json.loads(text))
-    return escape(text)
+    if isinstance(value, list):
+        return ", ".join(f"{item:g}" if _is_number(item) else _cell(item) for item in value)
+    return short(value) if _is_number(value) else escape(str(value))

@@ -1,27 +1,13 @@
 """What fused.c gives to Python; arrays are addresses, 0 for none."""
 
-def look(
-    points: int,
-    sources: int,
-    index: int,
-    count: int,
-    k: int,
-    noise: float,
-    start: int,
-    stop: int,
-    embedding: int,
-    normals: int,
-    shapes: int,
-    features: int,
-    /,
-) -> None: ...
+from typing import TypeAlias
+
+Surroundings: TypeAlias = tuple[int, int, int, int, int, float]
+"""points, sources, index, count, neighbours of a point, noise."""
+
+def look(around: Surroundings, start: int, stop: int, embedding: int, normals: int, shapes: int, features: int, /) -> None: ...
 def talk(
-    points: int,
-    sources: int,
-    index: int,
-    count: int,
-    k: int,
-    noise: float,
+    around: Surroundings,
     start: int,
     stop: int,
     normals: int,

@@ -31,6 +31,14 @@ typedef int32_t Mask __attribute__((vector_size(LANES * sizeof(int32_t)), aligne
 typedef struct { Lanes part[VECTORS]; } Channels;
 
 typedef struct {
+    const double *points, *sources; /* (M, 3), (N, 3) */
+    const int32_t *index;           /* (M, k): rows of each point's sources */
+    const float *count;             /* (N,), or none */
+    int k;
+    float noise;
+} Surroundings;
+
+typedef struct {
     int k;
     float scale;                                               /* in the points' unit; everything else is in units of it */
     float x[MOST_NEIGHBOURS], y[MOST_NEIGHBOURS], z[MOST_NEIGHBOURS];  /* source minus point */
@@ -88,9 +96,11 @@ INLINE float falling_exponential(float x) {
     return (root * root) * (root * root);
 }
 
-INLINE void neighbourhood(Neighbourhood *near, const double *point, const double *sources, const int32_t *index,
-                          const float *count, int k) {
-    near->k = k;
+INLINE void neighbourhood(Neighbourhood *near, const Surroundings *around, int64_t i) {
+    const double *point = around->points + 3 * i, *sources = around->sources;
+    const int32_t *index = around->index + i * around->k;
+    const float *count = around->count;
+    const int k = near->k = around->k;
     for (int j = 0; j < k; j++) {
         const double *source = sources + 3 * (size_t)index[j];
         near->x[j] = (float)(source[0] - point[0]);
@@ -187,17 +197,16 @@ INLINE void plane(const Neighbourhood *near, float *normal, float *shape) {
 }
 
 /* Planes and first features of the points in rows [start, stop). */
-static ANY_PROCESSOR void look(const double *points, const double *sources, const int32_t *index, const float *count,
-                               int k, float noise, int64_t start, int64_t stop, const Embedding *embedding,
+static ANY_PROCESSOR void look(const Surroundings *around, int64_t start, int64_t stop, const Embedding *embedding,
                                float *normals, float *shapes, float *features) {
     Neighbourhood near;
     for (int64_t i = start; i < stop; i++) {
         float *shape = shapes + 3 * i;
-        neighbourhood(&near, points + 3 * i, sources, index + i * k, count, k);
+        neighbourhood(&near, around, i);
         plane(&near, normals + 3 * i, shape);
         if (!embedding) continue;
         const float thin = shape[0] / near.scale, middle = shape[1] / near.scale, wide = shape[2] / near.scale;
-        const float level = noise / near.scale;
+        const float level = around->noise / near.scale;
         const float known[POINT_FEATURES] = {2 * thin, 2 * (wide - middle), 4 * level / (1 + level), thin / (thin + level + 1e-6f)};
         store(features + CHANNELS * i, layer(load(embedding->bias), known, POINT_FEATURES, embedding->weight[0]));
     }
@@ -314,18 +323,17 @@ INLINE void step(const Head *head, const Neighbourhood *near, const Edges *edge,
 /* Rounds of messages of the points in rows [start, stop), and their step where there is a head.
 
    `heard` holds what the sources say in each round, one array after the other, `n_heard` floats each. */
-static ANY_PROCESSOR void talk(const double *points, const double *sources, const int32_t *index, const float *count,
-                               int k, float noise, int64_t start, int64_t stop, const float *normals, const float *their_normals,
-                               const Round *rounds, int n_rounds, const float *heard, int64_t n_heard,
+static ANY_PROCESSOR void talk(const Surroundings *around, int64_t start, int64_t stop, const float *normals,
+                               const float *their_normals, const Round *rounds, int n_rounds, const float *heard, int64_t n_heard,
                                const float *before, float *features, const Head *head, float *moves) {
     Neighbourhood near;
     Edges edge;
     float messages[MOST_NEIGHBOURS][CHANNELS];
     for (int64_t i = start; i < stop; i++) {
-        const int32_t *row = index + i * k;
+        const int32_t *row = around->index + i * around->k;
         float own[CHANNELS];
-        neighbourhood(&near, points + 3 * i, sources, row, count, k);
-        edges(&edge, &near, normals + 3 * i, their_normals, row, noise);
+        neighbourhood(&near, around, i);
+        edges(&edge, &near, normals + 3 * i, their_normals, row, around->noise);
         memcpy(own, before + CHANNELS * i, sizeof own);
         for (int r = 0; r < n_rounds; r++) exchange(rounds + r, &near, &edge, row, heard + r * n_heard, own, messages);
         memcpy(features + CHANNELS * i, own, sizeof own);
@@ -337,35 +345,40 @@ static ANY_PROCESSOR void talk(const double *points, const double *sources, cons
 
 #define AT(type, address) ((type *)(uintptr_t)(address))
 
+static int surroundings(PyObject *given, void *into) {
+    unsigned long long points, sources, index, count;
+    Surroundings *around = into;
+    if (!PyArg_ParseTuple(given, "KKKKif", &points, &sources, &index, &count, &around->k, &around->noise)) return 0;
+    around->points = AT(double, points), around->sources = AT(double, sources);
+    around->index = AT(int32_t, index), around->count = AT(float, count);
+    return 1;
+}
+
 static PyObject *call_look(PyObject *self, PyObject *args) {
-    unsigned long long points, sources, index, count, embedding, normals, shapes, features;
+    Surroundings around;
+    unsigned long long embedding, normals, shapes, features;
     long long start, stop;
-    float noise;
-    int k;
     (void)self;
-    if (!PyArg_ParseTuple(args, "KKKKifLLKKKK", &points, &sources, &index, &count, &k, &noise, &start, &stop, &embedding, &normals,
-                          &shapes, &features))
+    if (!PyArg_ParseTuple(args, "O&LLKKKK", surroundings, &around, &start, &stop, &embedding, &normals, &shapes, &features))
         return NULL;
     Py_BEGIN_ALLOW_THREADS
-    look(AT(double, points), AT(double, sources), AT(int32_t, index), AT(float, count), k, noise, start, stop,
-         AT(Embedding, embedding), AT(float, normals), AT(float, shapes), AT(float, features));
+    look(&around, start, stop, AT(Embedding, embedding), AT(float, normals), AT(float, shapes), AT(float, features));
     Py_END_ALLOW_THREADS
     Py_RETURN_NONE;
 }
 
 static PyObject *call_talk(PyObject *self, PyObject *args) {
-    unsigned long long points, sources, index, count, normals, their_normals, rounds, heard, before, features, head, moves;
+    Surroundings around;
+    unsigned long long normals, their_normals, rounds, heard, before, features, head, moves;
     long long start, stop, n_heard;
-    float noise;
-    int k, n_rounds;
+    int n_rounds;
     (void)self;
-    if (!PyArg_ParseTuple(args, "KKKKifLLKKKiKLKKKK", &points, &sources, &index, &count, &k, &noise, &start, &stop, &normals,
-                          &their_normals, &rounds, &n_rounds, &heard, &n_heard, &before, &features, &head, &moves))
+    if (!PyArg_ParseTuple(args, "O&LLKKKiKLKKKK", surroundings, &around, &start, &stop, &normals, &their_normals, &rounds,
+                          &n_rounds, &heard, &n_heard, &before, &features, &head, &moves))
         return NULL;
     Py_BEGIN_ALLOW_THREADS
-    talk(AT(double, points), AT(double, sources), AT(int32_t, index), AT(float, count), k, noise, start, stop, AT(float, normals),
-         AT(float, their_normals), AT(Round, rounds), n_rounds, AT(float, heard), n_heard, AT(float, before), AT(float, features),
-         AT(Head, head), AT(float, moves));
+    talk(&around, start, stop, AT(float, normals), AT(float, their_normals), AT(Round, rounds), n_rounds, AT(float, heard), n_heard,
+         AT(float, before), AT(float, features), AT(Head, head), AT(float, moves));
     Py_END_ALLOW_THREADS
     Py_RETURN_NONE;
 }

@@ -49,7 +49,7 @@ def looking(around: Surroundings, stage: Stage | None, planes: Planes, features:
     given = _given(around)
 
     def look(rows: slice) -> None:
-        _fused.look(*given, rows.start, rows.stop, _at(embedding), _at(planes.normal), _at(planes.shape), _at(features))
+        _fused.look(given, rows.start, rows.stop, _at(embedding), _at(planes.normal), _at(planes.shape), _at(features))
 
     return look
 
@@ -77,7 +77,7 @@ def talking(
 
     def talk(rows: slice) -> None:
         _fused.talk(
-            *given, rows.start, rows.stop, _at(normals[0]), _at(normals[1]),
+            given, rows.start, rows.stop, _at(normals[0]), _at(normals[1]),
             _at(weights), len(layers), _at(heard), heard[0].numel(), _at(before), _at(features), _at(head), _at(moves),
         )  # fmt: skip
 
@@ -89,7 +89,7 @@ def _packed(layer: nn.Module) -> Tensor:
     return torch.cat([parameter.detach().t().flatten() for parameter in layer.parameters()])
 
 
-def _given(around: Surroundings) -> tuple[int, int, int, int, int, float]:
+def _given(around: Surroundings) -> _fused.Surroundings:
     points, sources, index, count = map(_at, (around.points, around.sources, around.index, around.count))
     return points, sources, index, count, around.index.shape[1], around.noise
 

@@ -61,7 +61,7 @@ def edges(offset: Tensor, index: Tensor, count: Tensor | None) -> Edges:
     with torch.no_grad():
         squared = offset.square().sum(-1)
         scale = _KERNEL_SHARE * squared.amax(-1, keepdim=True).sqrt().clamp_min(1e-12)
-        squared = squared / scale.square().clamp_min(1e-30)
+        squared = squared / scale.square()
         weight = torch.exp(-squared) * (1 - _KERNEL_SHARE**2 * squared).clamp_min(0).square()
         if count is not None:
             weight = weight * count.index_select(0, index.reshape(-1)).view(index.shape)
