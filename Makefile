@@ -2,7 +2,7 @@
 PYTHON ?= python3
 PIP := .venv/bin/python -m pip --disable-pip-version-check
 BIN := .venv/bin
-COMPILED := src/pcdenoise/networks/fused.c
+COMPILED := $(wildcard src/pcdenoise/*/*.[ch])
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test lint types docs site bench clean

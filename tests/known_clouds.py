@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 
-from pcdenoise.networks.store import Model, ModelConfig
+from pcdenoise.networks.store import Model
 from pcdenoise.synthesis import shapes
 
 SURFACES = {
@@ -75,11 +75,8 @@ def model(kind: str) -> Model:
     with torch.inference_mode(False), torch.random.fork_rng(), torch.no_grad():
         torch.manual_seed(11)
         if kind == "mcconv":
-            network = MCConvNetwork(PAPER).eval()
-            config = ModelConfig.model_validate({"network": kind, "settings": asdict(PAPER)})
-            return Model(kind, network, config, "0" * 64)
-        network = ProjectionNetwork(ProjectionConfig(landing_rounds=2)).eval()
+            return Model.of(MCConvNetwork(PAPER), kind)
+        network = ProjectionNetwork(ProjectionConfig(landing_rounds=2))
         for stage in [*network.among, network.landing] if kind == "seeded" else []:
             stage.step.head.weight.normal_(std=0.1)
-    settings = asdict(network.config)
-    return Model(kind, network, ModelConfig.model_validate({"network": "projection", "settings": settings}), "0" * 64)
+    return Model.of(network, kind)

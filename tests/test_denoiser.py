@@ -21,7 +21,7 @@ from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import denoiser, pyramid
 from pcdenoise.denoising.denoiser import Result, denoise, iterate
 from pcdenoise.denoising.held_out import HeldOut
-from pcdenoise.denoising.pyramid import share_of_seeds
+from pcdenoise.denoising.seeds import share_of_seeds
 from pcdenoise.errors import ModelError, UsageError
 from pcdenoise.networks import fused, store
 from pcdenoise.networks.mcconv import MCConvNetwork
@@ -127,7 +127,8 @@ def test_one_seed_gives_the_same_bytes_and_another_one_other_seeds(coarse: Cloud
 
 
 def test_the_number_of_threads_does_not_show(coarse: Cloud, coarse_result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pyramid.descend, "__kwdefaults__", {**pyramid.descend.__kwdefaults__, "block_points": 500})
+    for descend in (pyramid.descend, fused.descend):
+        monkeypatch.setattr(descend, "__kwdefaults__", {**descend.__kwdefaults__, "block_points": 500})
     before = torch.get_num_threads()
     by_two = clean(coarse.noisy, threads=2).points
     np.testing.assert_allclose(by_two, coarse_result.points, atol=1e-5 * coarse.spacing)
@@ -439,4 +440,4 @@ def test_the_network_needs_a_model_and_a_model_needs_numbers(fine: Cloud) -> Non
             broken.among[0].step.head.bias.fill_(0.0 if stage else float("nan"))
             broken.among[1].step.head.bias.fill_(float("nan"))
         with pytest.raises(ModelError, match=r"^[^\n]*positions that are not numbers; use another model[^\n]*$"):
-            denoise(fine.noisy, replace(model("untrained"), name="broken", network=broken), PLAIN)
+            denoise(fine.noisy, Model.of(broken, "broken"), PLAIN)

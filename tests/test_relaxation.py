@@ -13,6 +13,14 @@ from pcdenoise.denoising.relaxation import relax, without_low_frequencies
 STEPS = 8
 
 
+@pytest.fixture(params=["numpy", "compiled"], autouse=True)
+def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Either way of computing it."""
+    if request.param == "compiled" and not relaxation.IS_BUILT:
+        pytest.skip("was installed where no C compiler is")
+    monkeypatch.setattr(relaxation, "IS_BUILT", request.param == "compiled")
+
+
 def unevenness(points: np.ndarray) -> float:
     """Coefficient of variation of the distance to the nearest other point: 0.52 for Poisson points, 0 for a lattice."""
     nearest = knn(points, 2, threads=1)[0][:, 1]
@@ -111,6 +119,13 @@ def test_blocks_and_threads_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None
     whole = relax(noisy.noisy, 0.3 * noisy.spacing, STEPS, threads=1)
     monkeypatch.setattr(relaxation, "_BLOCK", 101)
     np.testing.assert_allclose(relax(noisy.noisy, 0.3 * noisy.spacing, STEPS, threads=2), whole, atol=1e-12)
+
+
+def test_compiled_code_and_numpy_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    noisy = cloud("cube", 1200, 0.3)
+    one = relax(noisy.noisy, 0.5 * noisy.spacing, STEPS, threads=1)
+    monkeypatch.setattr(relaxation, "IS_BUILT", False)
+    np.testing.assert_allclose(relax(noisy.noisy, 0.5 * noisy.spacing, STEPS, threads=1), one, atol=1e-9 * noisy.spacing)
 
 
 def test_the_input_is_not_written_to() -> None:

@@ -168,7 +168,7 @@ def test_who_learns_without_truth_gets_the_noisy_files_of_a_synth_folder_alone(t
 def test_a_teacher_leaves_a_surface_closer_to_the_truth_and_the_noise_that_it_took_off(surface):
     rng = np.random.default_rng(4)
     noisy = surface.points[:20_000] + STD * rng.standard_normal((20_000, 3))
-    model = store.Model("untrained", ProjectionNetwork(ProjectionConfig(channels=4, rounds=(1, 1))), None, "")
+    model = store.Model.of(ProjectionNetwork(ProjectionConfig(channels=4, rounds=(1, 1))), "untrained")
     made = cleaned(noisy, model, own_law=1.0)
     np.testing.assert_allclose(made.points + made.residual, noisy, atol=1e-12)
     assert np.std(np.linalg.norm(made.points, axis=1)) < 0.5 * STD

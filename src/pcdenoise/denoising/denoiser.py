@@ -1,6 +1,6 @@
 """One pass over a cloud, passes in a row, and when to stop.
 
-Not here: files (commands), the network's run (pyramid.py), filters (classical.py).
+Not here: files (commands), what a network does in a pass (network_pass.py), filters (classical.py).
 """
 
 from __future__ import annotations
@@ -9,8 +9,7 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
-from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,14 +19,11 @@ from pcdenoise.cloud.neighbours import coordinate_hash, distinct_by, drawn_by, s
 from pcdenoise.cloud.noise_level import NoiseLevel, estimate, estimate_at, probes
 from pcdenoise.cloud.scan import Mask, Points, check_extent, within
 from pcdenoise.config import DenoiseConfig
-from pcdenoise.denoising import classical, outliers, uncertainty
+from pcdenoise.denoising import classical, network_pass, outliers, uncertainty
 from pcdenoise.denoising.held_out import HeldOut
-from pcdenoise.errors import ModelError, UsageError
-from pcdenoise.networks.store import Model
-
-if TYPE_CHECKING:
-    from pcdenoise.networks.mcconv import MCConvNetwork
-    from pcdenoise.networks.projection import ProjectionNetwork
+from pcdenoise.denoising.relaxation import relax, without_low_frequencies
+from pcdenoise.errors import UsageError
+from pcdenoise.networks.store import Model, ProjectionSettings
 
 FEWEST_POINTS = 16
 """Smaller clouds come back as they were: no surface can be told from them."""
@@ -36,7 +32,6 @@ N_CENTRAL = 1 << 16
 _MOST_PASSES = 10
 _SHRINKING = 0.035
 """Radius over which moves that all points share are taken back, in the network's units of length; as released."""
-_DECODED_AT_ONCE = 65_536
 _FURTHEST_STDS = 5.0
 """Longest move of one pass along the normal: what is further from the surface is no noise but an outlier or another thing."""
 _WORTHWHILE = 2e-4
@@ -286,16 +281,13 @@ def one_pass(
         return _unshrunk(points, moved, diagonal, config) if config.unshrink else moved
     if model is None:
         raise UsageError("--method network needs a model; give --model, or choose --method jet")
-    from pcdenoise.denoising.relaxation import relax
-    from pcdenoise.networks.mcconv import MCConvNetwork
-
-    if isinstance(model.network, MCConvNetwork):
-        unit = model.network.config.unit or diagonal
-        moved = _mcconv_pass(points, unit, model.network, config.seed, threads, on_share)
-        moved = moved if config.unshrink is False else _unshrunk(points, moved, unit, config)
-    else:
-        moved = _projection_pass(points, identity, level, model.network, config.seed, threads, on_share)
+    if isinstance(model.config.settings, ProjectionSettings):
+        moved = network_pass.projection(points, identity, level, model, config.seed, threads, on_share)
         moved = _unshrunk(points, moved, diagonal, config) if config.unshrink else moved
+    else:
+        unit = model.config.settings.unit or diagonal
+        moved = network_pass.mcconv(points, unit, model, config.seed, threads, on_share)
+        moved = moved if config.unshrink is False else _unshrunk(points, moved, unit, config)
     return relax(within(_FURTHEST_STDS * level.std, points, moved), level.std, config.relax_steps, threads)
 
 
@@ -309,64 +301,4 @@ def _filtered(points: Points, level: NoiseLevel, diagonal: float, config: Denois
 
 
 def _unshrunk(points: Points, moved: Points, unit: float, config: DenoiseConfig) -> Points:
-    from pcdenoise.denoising.relaxation import without_low_frequencies
-
     return points + without_low_frequencies(points, moved - points, _SHRINKING * unit, np.random.default_rng(config.seed))
-
-
-def _mcconv_pass(
-    points: Points, unit: float, network: MCConvNetwork, seed: int, threads: int, on_share: Callable[[float], None]
-) -> Points:
-    """In the network's frame. Only the first level, which is small, is looked at as a whole; the points follow in blocks."""
-    import torch
-
-    from pcdenoise.denoising.blocks import torch_threads
-
-    rng = np.random.default_rng(seed)
-    centre = (points.min(axis=0) + points.max(axis=0)) / 2
-    local = torch.from_numpy((points - centre) / unit)
-    moves = []
-    with torch_threads(threads), torch.no_grad():
-        code = network.encode(local, rng)
-        for start in range(0, len(points), _DECODED_AT_ONCE):
-            moves.append(network.decode(code, local[start : start + _DECODED_AT_ONCE], rng).double().numpy())
-            on_share(min((start + _DECODED_AT_ONCE) / len(points), 1.0))
-    move = np.concatenate(moves)
-    if not np.isfinite(move).all():
-        raise ModelError("the network gave positions that are not numbers; use another model, or --method jet")
-    return points + unit * move
-
-
-def _projection_pass(
-    points: Points,
-    identity: Identity,
-    level: NoiseLevel,
-    network: ProjectionNetwork,
-    seed: int,
-    threads: int,
-    on_share: Callable[[float], None],
-) -> Points:
-    import torch
-
-    from pcdenoise.denoising.blocks import torch_threads
-    from pcdenoise.denoising.pyramid import coarsen, descend, share_of_seeds
-
-    share = share_of_seeds(level, network.config.neighbours)
-    done, counting = 0, Lock()
-    seeds, count, cell = points, None, np.arange(len(points))
-    if share < 1:
-        coarse = coarsen(points, share, seed, threads, identity)
-        seeds, count, cell = coarse.points, coarse.count, coarse.cell
-    total = len(seeds) * sum(network.config.rounds) + (len(points) * network.config.landing_rounds if share < 1 else 0)
-
-    def on_block(n: int) -> None:
-        nonlocal done
-        with counting:
-            done += n
-            on_share(done / total)
-
-    with torch_threads(1), torch.no_grad():
-        descent = descend(network, seeds, count, points if share < 1 else None, level.std, threads=threads, on_block=on_block)
-        moved: Points = (descent.seeds[-1] if descent.landed is None else descent.landed).numpy()
-    trust = descent.trust.numpy().astype(np.float64)[cell, None]
-    return points + trust * (moved - points)

@@ -1,7 +1,7 @@
-"""How the projection network is run: raw points to seeds, stages among the seeds, all points landing on their surface.
+"""How the projection network is run in torch: stages among the seeds, then all points landing on their surface.
 
-Coarse to fine in O(N·K), in blocks that fit the cache. Not here: the network itself (networks.projection), passes and stop
-rules (denoiser.py).
+With gradients this is what learning goes through; without them it stands in where there is no compiled code (networks.fused).
+In blocks that fit the cache. Not here: the network itself (networks.projection), seeds (seeds.py), passes (network_pass.py).
 """
 
 from __future__ import annotations
@@ -14,12 +14,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pcdenoise.cloud.neighbours import Indices, NeighbourSearch, coordinate_hash, drawn_by
-from pcdenoise.cloud.noise_level import NoiseLevel
+from pcdenoise.cloud.blocks import BLOCK_POINTS, blocks, each_block
+from pcdenoise.cloud.neighbours import NeighbourSearch
 from pcdenoise.cloud.scan import Points
-from pcdenoise.denoising.blocks import BLOCK_POINTS, each_block, in_blocks
-from pcdenoise.errors import ModelError
-from pcdenoise.networks import fused
+from pcdenoise.networks.fused import numbers
 from pcdenoise.networks.projection import (
     Edges,
     Planes,
@@ -30,83 +28,19 @@ from pcdenoise.networks.projection import (
     edges,
     planes,
     point_features,
-    trust,
 )
-
-_APART = {1: 0.52, 2: 0.39, 3: 0.31, 5: 0.23}
-"""Share of candidates that remain when none may be among the so many nearest of another (measured)."""
-_LANDSCAPE = 11.0
-"""Neighbourhoods hold 11·√(points that show the surface) raw points: the balance of noise, which asks for all of them, and of
-curvature, which asks for few (measured on shapes that serve for nothing else)."""
-
-
-@dataclass(frozen=True)
-class Seeds:
-    """points (M, 3): means of the raw points in each seed's cell; count (M,) of them; cell (N,): each raw point's seed."""
-
-    points: Points
-    count: NDArray[np.float64]
-    cell: Indices
-
-
-def share_of_seeds(level: NoiseLevel, neighbours: int) -> float:
-    """Seeds per raw point, so that those the network looks at stand for the right number of raw points; 1 for little noise."""
-    share = neighbours / (_LANDSCAPE * level.scale_points**0.5)
-    densest = max(_APART.values())
-    return min(share, densest) if share < 1.5 * densest else 1.0
-
-
-def coarsen(points: Points, share: float, seed: int = 0, threads: int = -1, identity: NDArray[np.uint64] | None = None) -> Seeds:
-    """About share * N seeds of (N, 3) finite points in spatial order, spread evenly relative to the local density.
-
-    identity (N,): what to draw by in place of the coordinates, for points whose last bits depend on how they were computed.
-    Candidates are drawn by hash; those that are first among their nearest candidates stay, round by round; every raw point
-    then joins its nearest seed. Averaging inside the cells keeps the statistical weight of every raw point.
-    """
-    apart = max((n for n, left in _APART.items() if left >= share), default=1)
-    drawn = drawn_by(coordinate_hash(points, 0) if identity is None else identity, seed)
-    is_candidate = drawn < np.uint64(min(share / _APART[apart], 1.0) * float(2**64 - 2**11))
-    candidates = points[is_candidate]
-    if len(candidates) <= apart + 1:
-        return Seeds(points, np.ones(len(points)), np.arange(len(points)))
-    chosen = candidates[_first_among_nearest(candidates, drawn_by(drawn[is_candidate], 1), apart, threads)]
-    cell = NeighbourSearch(chosen, threads).knn(points, 1)[1][:, 0]
-    count = np.bincount(cell, minlength=len(chosen)).astype(np.float64)
-    filled = count > 0
-    origin = chosen.mean(axis=0)
-    sums = np.stack([np.bincount(cell, weights=column, minlength=len(chosen)) for column in (points - origin).T], axis=1)
-    number = np.cumsum(filled) - 1
-    return Seeds(sums[filled] / count[filled, None] + origin, count[filled], number[cell])
-
-
-def _first_among_nearest(candidates: Points, rank: NDArray[np.uint64], apart: int, threads: int) -> Indices:
-    """Rows of a maximal set in which none is among the nearest of another: greedy in order of rank, all places at once."""
-    n = len(candidates)
-    near = NeighbourSearch(candidates, threads).knn(candidates, apart + 1)[1][:, 1:].ravel()
-    self_ = np.repeat(np.arange(n), apart)
-    ends, others = np.concatenate([self_, near]), np.concatenate([near, self_])
-    place = np.empty(n, dtype=np.int64)
-    place[np.lexsort((np.arange(n), rank))] = np.arange(n)
-    undecided, chosen = np.ones(n, dtype=bool), np.zeros(n, dtype=bool)
-    while undecided.any():
-        best = np.where(undecided, place, n)
-        np.minimum.at(best, ends, np.where(undecided[others], place[others], n))
-        first = undecided & (best == place)
-        chosen |= first
-        undecided &= ~first
-        undecided[others[first[ends]]] = False
-    return np.flatnonzero(chosen)
 
 
 @dataclass(frozen=True)
 class Descent:
     """What a run of the network gives.
 
-    seeds: their places after every stage, (M, 3) each; trust (M,): see networks.projection; landed: raw points (Q, 3), if any.
+    seeds: their places after every stage, (M, 3) each; shape (M, 3): that of the planes around them at first; landed: raw points
+    (Q, 3), if any.
     """
 
     seeds: list[Tensor]
-    trust: Tensor
+    shape: Tensor
     landed: Tensor | None
 
 
@@ -128,55 +62,63 @@ def descend(
     """
     points = torch.from_numpy(np.ascontiguousarray(seeds))
     weights = None if count is None else torch.from_numpy(count.astype(np.float32))
-    kind = _Fused if fused.runs(network) else _Looking
 
-    def neighbours(points: Tensor, sources: Tensor) -> Tensor:
+    def nearest(points: Tensor, sources: Tensor) -> Tensor:
         search = NeighbourSearch(sources.detach().numpy(), threads)
         return torch.from_numpy(search.nearest(points.detach().numpy(), network.config.neighbours))
 
-    def looking(points: Tensor, sources: Tensor, index: Tensor) -> _Looking | _Fused:
-        return kind(fused.Surroundings(points, sources, index, weights, noise), block_points, threads)
+    def looking(points: Tensor, sources: Tensor, index: Tensor) -> _Looking:
+        return _Looking(_Surroundings(points, sources, index, weights, noise), block_points, threads)
 
+    index = nearest(points, points)
     features: Tensor | None = None
     stages: list[Tensor] = []
-    surface = torch.ones(0)
-    index: Tensor | None = None
+    shape = torch.empty(0, 3)
     for stage in network.among:
-        if index is None or raw is not None:  # points that are their own seeds hardly move: they keep their neighbours
-            index = neighbours(points, points)
         among = looking(points, points, index)
         own, known = among.around(stage)
-        surface = surface if stages else trust(own, noise)
+        shape = shape if stages else own.shape
         features = known if features is None else features + known
         move, features = among.messages(stage, own, features, on_block)
         points = _numbers(points + move.double())
         stages.append(points)
+        if raw is not None:  # points that are their own seeds hardly move: they keep their neighbours
+            index = nearest(points, points)
     if raw is None or features is None:
-        return Descent(stages, surface, None)
-    seed_planes = looking(points, points, neighbours(points, points)).planes()
+        return Descent(stages, shape, None)
+    seed_planes = looking(points, points, index).planes()
     landing = torch.from_numpy(np.ascontiguousarray(raw))
-    move = looking(landing, points, neighbours(landing, points)).landing(network.landing, seed_planes, features, on_block)
-    return Descent(stages, surface, _numbers(landing + move.double()))
+    move = looking(landing, points, nearest(landing, points)).landing(network.landing, seed_planes, features, on_block)
+    return Descent(stages, shape, _numbers(landing + move.double()))
 
 
 def _numbers(points: Tensor) -> Tensor:
-    """The points. Raises ModelError where one is no number, which only broken weights bring about."""
-    if not bool(points.isfinite().all()):
-        raise ModelError("the network gave positions that are not numbers; use another model, or --method jet")
+    numbers(points.detach().numpy())
     return points
+
+
+@dataclass(frozen=True)
+class _Surroundings:
+    """M points that look at K sources each: points (M, 3), sources (N, 3) float64, index (M, K) int32, count (N,) or None."""
+
+    points: Tensor
+    sources: Tensor
+    index: Tensor
+    count: Tensor | None
+    noise: float
 
 
 class _Looking:
     """M points that look at their nearest sources, block by block; with a single block nothing is computed twice."""
 
-    def __init__(self, here: fused.Surroundings, block_points: int, threads: int) -> None:
+    def __init__(self, here: _Surroundings, block_points: int, threads: int) -> None:
         self.here, self.block_points, self.threads = here, block_points, threads
         self._only: Edges | None = None
         self._only_features: tuple[Tensor, Tensor, Tensor] | None = None
 
     def over_blocks(self, work: Callable[[slice, Edges], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
         """What `work` gives for each block and its edges, put together."""
-        return in_blocks(lambda block: work(block, self._edges(block)), len(self.here.points), self.threads, self.block_points)
+        return _in_blocks(lambda block: work(block, self._edges(block)), len(self.here.points), self.threads, self.block_points)
 
     @property
     def in_one(self) -> bool:
@@ -248,55 +190,29 @@ class _Looking:
         return self._only_features
 
 
-class _Fused:
-    """What `_Looking` does, in compiled code: no edge is ever written to memory."""
+_Work = Callable[[slice], tuple[Tensor, ...]]
 
-    def __init__(self, here: fused.Surroundings, block_points: int, threads: int) -> None:
-        self.here, self.block_points, self.threads = here, block_points, threads
 
-    def planes(self) -> Planes:
-        """Tangent planes of all points."""
-        return self._seen(None)[0]
+def _in_blocks(work: _Work, n: int, threads: int, block_points: int) -> tuple[Tensor, ...]:
+    """What `work` gives for the rows of each block, (B, …) each, put together to (n, …); n >= 1.
 
-    def around(self, stage: Stage) -> tuple[Planes, Tensor]:
-        """Tangent planes and first features (M, C) of all points."""
-        return self._seen(stage)
+    Without gradients every result goes to its place at once, so that nothing but the results outlives its block.
+    """
+    parts = blocks(n, block_points)
+    if len(parts) == 1:
+        return work(parts[0])
+    if torch.is_grad_enabled():  # known to this thread alone
+        return tuple(map(torch.cat, zip(*map(work, parts), strict=True)))
+    first = work(parts[0])
+    whole = tuple(part.new_empty((n, *part.shape[1:])) for part in first)
 
-    def messages(self, stage: Stage, planes: Planes, features: Tensor, on_block: Callable[[int], None]) -> tuple[Tensor, Tensor]:
-        """(M, 3) moves and (M, C) features after all rounds of a stage, one by one: points hear of each other's news."""
-        moves = torch.empty(len(features), 3)
-        for number, layer in enumerate(stage.exchanges):
-            last = number + 1 == len(stage.exchanges)
-            heard = layer.hear(features)[None]
-            rounds = slice(number, number + 1)
-            features = self._told(stage, rounds, planes, planes, heard, features, moves if last else None, on_block)
-        return moves, features
+    def put(block: slice, results: tuple[Tensor, ...]) -> None:
+        for place, result in zip(whole, results, strict=True):
+            place[block] = result
 
-    def landing(self, stage: Stage, theirs: Planes, sources: Tensor, on_block: Callable[[int], None]) -> Tensor:
-        """(M, 3) moves of points that hear of sources alone, whose planes and features (N, C) stay."""
-        heard = torch.stack([layer.hear(sources) for layer in stage.exchanges])
-        mine, features = self._seen(stage)
-        moves = torch.empty(len(features), 3)
-        self._told(stage, slice(None), mine, theirs, heard, features, moves, on_block)
-        return moves
+    def one(block: slice) -> None:
+        with torch.no_grad():
+            put(block, first if block.start == 0 else work(block))
 
-    def _seen(self, stage: Stage | None) -> tuple[Planes, Tensor]:
-        n = len(self.here.points)
-        planes, features = Planes(torch.empty(n, 3), torch.empty(n, 3)), torch.empty(n if stage else 0, fused.CHANNELS)
-        look = fused.looking(self.here, stage, planes, features)
-        each_block(look, n, self.threads, self.block_points)
-        return planes, features
-
-    def _told(
-        self, stage: Stage, rounds: slice, mine: Planes, theirs: Planes, heard: Tensor, before: Tensor,
-        moves: Tensor | None, on_block: Callable[[int], None],
-    ) -> Tensor:  # fmt: skip
-        features = torch.empty_like(before)
-        talk = fused.talking(self.here, stage, rounds, (mine.normal, theirs.normal), heard, before, features, moves)
-
-        def told(block: slice) -> None:
-            talk(block)
-            on_block((block.stop - block.start) * len(heard))
-
-        each_block(told, len(before), self.threads, self.block_points)
-        return features
+    each_block(one, n, threads, block_points)
+    return whole

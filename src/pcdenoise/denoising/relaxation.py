@@ -1,18 +1,26 @@
 """What is done about moves: relaxation toward even spacing, low frequencies taken back.
 
-Not here: moves along the normal (the network's), the limit on any move (cloud.scan).
+Relaxation runs in compiled code (relaxation.c) where a C compiler was when the program was installed, else in numpy, which says
+what it does; both agree to rounding. Not here: moves along the normal (the network's), the limit on any move (cloud.scan).
 """
 
 from __future__ import annotations
 
-import numpy as np
-import torch
-from torch import Tensor
+from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
+from pcdenoise.cloud.blocks import each_block
 from pcdenoise.cloud.neighbours import NeighbourSearch, pairs_within, thinned
 from pcdenoise.cloud.scan import Points, within
-from pcdenoise.denoising import blocks
-from pcdenoise.networks.projection import Edges, planes, smallest_eigenvector
+
+try:
+    from pcdenoise.denoising import _relaxation
+except ImportError:
+    IS_BUILT = False
+else:
+    IS_BUILT = True
 
 _NEIGHBOURS = 12
 _STEP = 0.35  # of the local spacing, at most, per step
@@ -23,7 +31,7 @@ the surface too, so a clean cloud stays as it is."""
 _SHEET = (0.25, 0.4)
 """Planarity, (√λ₂ - √λ₁) / √λ₃ of the covariance's ascending eigenvalues, at which points begin to slide and slide in full:
 one in a hundred neighbourhoods of a surface has less than 0.4, half of those in a volume or on a wire less than 0.21."""
-_BLOCK = 2 * blocks.BLOCK_POINTS
+_BLOCK = 2048
 _LOW_PASS_STD = 0.4 * 2**0.5  # of its radius, as released
 _LOW_PASS_POINTS = 256  # within its radius: more are thinned
 
@@ -40,24 +48,13 @@ def relax(points: Points, noise_std: float, steps: int, threads: int = -1) -> Po
         return points
     k = min(_NEIGHBOURS, len(points) - 1)
     distances, found = NeighbourSearch(points, threads).knn(points, k + 1)
-    index = torch.from_numpy(found.astype(np.int32))
-    spacing = torch.from_numpy(distances[:, k:] / np.sqrt(k / 2.5))
+    start = np.ascontiguousarray(points)
+    sheet = (_Compiled if IS_BUILT else _Sheet)(start, found.astype(np.int32), distances[:, k] / np.sqrt(k / 2.5), threads)
     del distances, found
-
-    def over(work: blocks.Work) -> tuple[Tensor, ...]:
-        return blocks.in_blocks(work, len(points), threads, _BLOCK)
-
-    with blocks.torch_threads(1), torch.no_grad():
-        start = _by_axis(torch.from_numpy(points))
-        normal, sheet = over(lambda rows: _tangents(start, index[rows], rows))
-        normal = _by_axis(normal)
-        agreement = over(lambda rows: (_agreement(normal, index[rows, 1:], rows) * sheet[rows],))[0]
-        current = start
-        for _ in range(steps):
-            pushed = over(lambda rows: (_push(current, normal, agreement, spacing, index[rows, 1:], rows),))[0]  # noqa: B023
-            current = _by_axis(torch.from_numpy(within(_REACH_STDS * noise_std, points, pushed.numpy())))
-        landed = over(lambda rows: (_landed(current, start, normal, sheet, index[rows], rows),))[0]
-    return within(_REACH_STDS * noise_std, points, landed.numpy())
+    current = start
+    for _ in range(steps):
+        current = within(_REACH_STDS * noise_std, start, sheet.pushed(current))
+    return within(_REACH_STDS * noise_std, start, sheet.landed(current))
 
 
 def without_low_frequencies(points: Points, moves: Points, radius: float, rng: np.random.Generator) -> Points:
@@ -78,74 +75,90 @@ def without_low_frequencies(points: Points, moves: Points, radius: float, rng: n
     return left
 
 
-def _by_axis(vectors: Tensor) -> Tensor:
-    """(N, 3) vectors that lie axis by axis in memory."""
-    return vectors.t().contiguous().t()
+@dataclass
+class _Sheet:
+    """(N, 3) points with the rows of their neighbours (N, 1 + K), each point first, and their spacing (N,).
 
-
-def _near(vectors: Tensor, index: Tensor) -> list[Tensor]:
-    """x, y and z (M, K) of the vectors in (M, K) rows."""
-    flat = index.reshape(-1)
-    return [axis.index_select(0, flat).view(index.shape) for axis in vectors.unbind(1)]
-
-
-def _dot(one: list[Tensor], other: list[Tensor]) -> Tensor:
-    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
-
-
-def _each(vectors: Tensor, rows: slice) -> list[Tensor]:
-    """x, y and z (M, 1) of the vectors in some rows."""
-    return [axis[rows, None] for axis in vectors.unbind(1)]
-
-
-def _tangents(points: Tensor, index: Tensor, rows: slice) -> tuple[Tensor, Tensor]:
-    """(M, 3) unit normals and (M, 1) from 0, no surface (a wire, a volume), to 1, a sheet."""
-    near = _near(points, index)
-    offset = torch.stack([axis - own for axis, own in zip(near, _each(points, rows), strict=True)]).permute(1, 2, 0)
-    weight = torch.full(index.shape, 1 / index.shape[1], dtype=points.dtype)
-    plane = planes(Edges(offset, index, weight, torch.ones(len(index), 1, dtype=points.dtype)))
-    thin, middle, wide = _each(plane.shape, slice(None))
-    planarity = (middle - thin) / wide.clamp_min(1e-300)
-    return plane.normal, ((planarity - _SHEET[0]) / (_SHEET[1] - _SHEET[0])).clamp(0, 1)
-
-
-def _agreement(normal: Tensor, index: Tensor, rows: slice) -> Tensor:
-    """(M, K) squared cosines between a point's normal and its neighbours'."""
-    return _dot(_near(normal, index), _each(normal, rows)).square_()
-
-
-def _push(points: Tensor, normal: Tensor, strength: Tensor, spacing: Tensor, index: Tensor, rows: slice) -> Tensor:
-    """(M, 3) points one step further: repulsion in the tangent plane, faded where normals disagree."""
-    own, upright, reach = _each(points, rows), _each(normal, rows), spacing[rows]
-    away = [mine - theirs for mine, theirs in zip(own, _near(points, index), strict=True)]
-    distance = _dot(away, away).sqrt_().clamp_min_(1e-300)
-    weight = (distance.reciprocal() - 1 / (_PUSHING * reach)).clamp_min_(0).mul_(strength[rows])
-    push = [reach * (weight * axis).sum(1, keepdim=True) for axis in away]
-    height = _dot(push, upright)
-    push = [axis - height * up for axis, up in zip(push, upright, strict=True)]
-    step = _STEP * reach / torch.maximum(_dot(push, push).sqrt_(), reach).clamp_min_(1e-300)
-    return torch.cat([at + step * axis for at, axis in zip(own, push, strict=True)], dim=1)
-
-
-def _landed(points: Tensor, start: Tensor, normal: Tensor, sheet: Tensor, index: Tensor, rows: slice) -> Tensor:
-    """(M, 3) points back on the surface through the starting points: the projection network's step with plane normals alone.
-
-    A slide along a tangent plane leaves a curved surface by κt²/2. The mean height of the neighbours over the own plane and
-    the mean depth under their planes err by that much to either side, so that their half sum meets the surface.
+    normal (N, 3); sheet (N,): from 0, no surface (a wire, a volume), to 1.
     """
-    own, theirs = _each(points, rows), _near(normal, index)
-    offset = [there - mine for there, mine in zip(_near(start, index), own, strict=True)]
-    squared = _dot(offset, offset)
-    weight = (1 - squared / squared.amax(1, keepdim=True).clamp_min(1e-300)).square_().add_(1e-12)
-    weight /= weight.sum(1, keepdim=True)
-    tilted = [weight * axis for axis in theirs]
-    spread = {(i, j): (tilted[i] * theirs[j]).sum(1) for i in range(3) for j in range(i, 3)}
-    matrix = torch.stack([spread[min(i, j), max(i, j)] for i in range(3) for j in range(3)], dim=1).view(-1, 3, 3)
-    upright = _each(smallest_eigenvector(-matrix)[1], slice(None))
-    over = (weight * _dot(offset, upright)).sum(1, keepdim=True)
-    depth = _dot(offset, theirs)
-    share = 0.5 * sheet[rows]
-    moved = [
-        at + share * ((axis * depth).sum(1, keepdim=True) + over * up) for at, axis, up in zip(own, tilted, upright, strict=True)
-    ]
-    return torch.cat(moved, dim=1)
+
+    points: Points
+    index: NDArray[np.int32]
+    spacing: NDArray[np.float64]
+    threads: int
+
+    def __post_init__(self) -> None:
+        self.normal, self.sheet = np.empty_like(self.points), np.empty(len(self.points))
+        each_block(self._look, len(self.points), self.threads, _BLOCK)
+
+    def pushed(self, current: Points) -> Points:
+        """(N, 3) points one step further: repulsion in the tangent plane, faded where normals disagree."""
+        after = np.empty_like(current)
+        each_block(lambda rows: self._push(current, rows, after), len(current), self.threads, _BLOCK)
+        return after
+
+    def landed(self, current: Points) -> Points:
+        """(N, 3) points back on the surface through the starting points: the projection network's step with normals alone.
+
+        A slide along a tangent plane leaves a curved surface by κt²/2. The mean height of the neighbours over the own plane and
+        the mean depth under their planes err by that much to either side, so that their half sum meets the surface.
+        """
+        after = np.empty_like(current)
+        each_block(lambda rows: self._land(current, rows, after), len(current), self.threads, _BLOCK)
+        return after
+
+    def _look(self, rows: slice) -> None:
+        offset = self.points[self.index[rows]] - self.points[rows, None]
+        offset -= offset.mean(axis=1, keepdims=True)
+        eigenvalues, axes = np.linalg.eigh(offset.transpose(0, 2, 1) @ offset / self.index.shape[1])
+        thin, middle, wide = np.sqrt(np.maximum(eigenvalues, 0)).T
+        planarity = (middle - thin) / np.maximum(wide, 1e-300)
+        self.normal[rows] = axes[:, :, 0]
+        self.sheet[rows] = np.clip((planarity - _SHEET[0]) / (_SHEET[1] - _SHEET[0]), 0, 1)
+
+    def _push(self, current: Points, rows: slice, after: Points) -> None:
+        others, upright, reach = self.index[rows, 1:], self.normal[rows], self.spacing[rows, None]
+        away = current[rows, None] - current[others]
+        distance = np.maximum(np.linalg.norm(away, axis=2), 1e-300)
+        agreement = np.einsum("mkc,mc->mk", self.normal[others], upright) ** 2
+        weight = np.maximum(1 / distance - 1 / (_PUSHING * reach), 0) * agreement * self.sheet[rows, None]
+        push = reach * np.einsum("mk,mkc->mc", weight, away)
+        push -= (push * upright).sum(axis=1, keepdims=True) * upright
+        longest = np.maximum(np.linalg.norm(push, axis=1, keepdims=True), reach)
+        after[rows] = current[rows] + _STEP * reach / np.maximum(longest, 1e-300) * push
+
+    def _land(self, current: Points, rows: slice, after: Points) -> None:
+        offset, theirs = self.points[self.index[rows]] - current[rows, None], self.normal[self.index[rows]]
+        squared = (offset**2).sum(axis=2)
+        weight = (1 - squared / np.maximum(squared.max(axis=1, keepdims=True), 1e-300)) ** 2 + 1e-12
+        weight /= weight.sum(axis=1, keepdims=True)
+        upright = np.linalg.eigh(np.einsum("mk,mki,mkj->mij", weight, theirs, theirs))[1][:, :, 2]
+        over = np.einsum("mk,mkc,mc->m", weight, offset, upright)[:, None] * upright
+        under = np.einsum("mk,mk,mkc->mc", weight, (offset * theirs).sum(axis=2), theirs)
+        after[rows] = current[rows] + 0.5 * self.sheet[rows, None] * (under + over)
+
+
+class _Compiled(_Sheet):
+    """The same, point by point."""
+
+    def _look(self, rows: slice) -> None:
+        given = (self._graph, rows.start, rows.stop, _at(self.points))
+        _relaxation.tangents(*given, *_SHEET, _at(self.normal), _at(self.sheet))
+
+    def _push(self, current: Points, rows: slice, after: Points) -> None:
+        given = (self._graph, rows.start, rows.stop, _at(current), _at(self.normal), _at(self.sheet), _at(self.spacing))
+        _relaxation.push(*given, _PUSHING, _STEP, _at(after))
+
+    def _land(self, current: Points, rows: slice, after: Points) -> None:
+        given = (self._graph, rows.start, rows.stop, _at(current), _at(self.points), _at(self.normal), _at(self.sheet))
+        _relaxation.land(*given, _at(after))
+
+    @property
+    def _graph(self) -> _relaxation.Graph:
+        return _at(self.index), self.index.shape[1]
+
+
+def _at(values: NDArray[np.generic]) -> int:
+    """The address of dense values."""
+    assert values.flags.c_contiguous
+    return values.ctypes.data

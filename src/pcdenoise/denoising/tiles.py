@@ -38,6 +38,7 @@ from pcdenoise.cloud.scan import Mask, Points, check_extent
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import classical, denoiser, held_out, outliers, uncertainty
 from pcdenoise.denoising.denoiser import Identity, Progress
+from pcdenoise.denoising.seeds import share_of_seeds
 from pcdenoise.networks.store import Model
 from pcdenoise.whole_files import replaced
 
@@ -405,13 +406,11 @@ class Tiles:
         """How many nearest points a pass looks at, at that noise."""
         if self.config.method != "network":
             return self.config.neighbours or max(_RIM_NEIGHBOURS, classical.neighbourhood_size(level, 2))
-        from pcdenoise.denoising.pyramid import share_of_seeds
-
         return max(_RIM_NEIGHBOURS, round(self._looked_at / share_of_seeds(level, self._looked_at)))
 
     @property
     def _looked_at(self) -> int:
-        return int(getattr(self.model.network.config, "neighbours", _RIM_NEIGHBOURS)) if self.model else _RIM_NEIGHBOURS
+        return int(getattr(self.model.config.settings, "neighbours", _RIM_NEIGHBOURS)) if self.model else _RIM_NEIGHBOURS
 
     def _ball(self, level: NoiseLevel) -> float:
         """Radius of what a pass looks at, where that is a length: in the bilateral filter."""

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 
 from pcdenoise.cloud.neighbours import coordinate_hash, knn, spatial_order
 from pcdenoise.cloud.noise_level import estimate
-from pcdenoise.denoising.pyramid import coarsen, share_of_seeds
+from pcdenoise.denoising.seeds import coarsen, share_of_seeds
 from pcdenoise.synthesis import noise
 
 Array = NDArray[np.float64]

@@ -19,7 +19,7 @@ from pcdenoise.cloud.neighbours import distinct, parts, spatial_order
 from pcdenoise.cloud.noise_level import NoiseLevel, estimate
 from pcdenoise.cloud.scan import Points, Scan
 from pcdenoise.config import TrainConfig
-from pcdenoise.denoising.pyramid import Seeds, coarsen, share_of_seeds
+from pcdenoise.denoising.seeds import Seeds, coarsen, share_of_seeds
 from pcdenoise.errors import ScanError, UsageError
 from pcdenoise.learning.dataset import N_LANDING, N_RAW, N_SEEDS, PROCEDURAL, CloudsAhead
 from pcdenoise.learning.priors import Prior

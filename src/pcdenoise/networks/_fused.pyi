@@ -6,6 +6,7 @@ Surroundings: TypeAlias = tuple[int, int, int, int, int, float]
 """points, sources, index, count, neighbours of a point, noise."""
 
 def look(around: Surroundings, start: int, stop: int, embedding: int, normals: int, shapes: int, features: int, /) -> None: ...
+def hear(features: int, start: int, stop: int, weight: int, heard: int, /) -> None: ...
 def talk(
     around: Surroundings,
     start: int,

@@ -6,10 +6,7 @@
 
 #include <Python.h>
 
-#include <math.h>
-#include <stddef.h>
-#include <stdint.h>
-#include <string.h>
+#include "geometry.h"
 
 #define CHANNELS 32
 #define LANES 8
@@ -18,13 +15,6 @@
 #define POINT_FEATURES 4
 #define MOST_NEIGHBOURS 64
 #define KERNEL_SHARE 0.7f
-
-#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12
-#define ANY_PROCESSOR __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
-#else
-#define ANY_PROCESSOR
-#endif
-#define INLINE static inline __attribute__((always_inline))
 
 typedef float Lanes __attribute__((vector_size(LANES * sizeof(float)), aligned(4), may_alias));
 typedef int32_t Mask __attribute__((vector_size(LANES * sizeof(int32_t)), aligned(4), may_alias));
@@ -57,7 +47,6 @@ typedef struct { float weight[POINT_FEATURES][CHANNELS], bias[CHANNELS]; } Embed
 typedef struct { float weight[3][CHANNELS], bias[3]; } Head;
 
 INLINE float larger(float one, float other) { return one > other ? one : other; }
-INLINE double larger64(double one, double other) { return one > other ? one : other; }
 
 INLINE Channels load(const float *from) {
     Channels c;
@@ -121,59 +110,6 @@ INLINE void neighbourhood(Neighbourhood *near, const Surroundings *around, int64
         sum += near->weight[j];
     }
     for (int j = 0; j < k; j++) near->weight[j] /= larger(sum, 1e-12f);
-}
-
-INLINE void cross(double *result, const double *u, const double *v) {
-    result[0] = u[1] * v[2] - u[2] * v[1];
-    result[1] = u[2] * v[0] - u[0] * v[2];
-    result[2] = u[0] * v[1] - u[1] * v[0];
-}
-
-INLINE double dot(const double *u, const double *v) { return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]; }
-
-/* As smallest_eigenvector in projection.py: ascending eigenvalues, and the unit eigenvector of the smallest. */
-INLINE void smallest_eigenvector(const double matrix[3][3], double *eigenvalues, double *vector) {
-    const double mean = (matrix[0][0] + matrix[1][1] + matrix[2][2]) / 3;
-    double rows[3][3], squared = 0;
-    for (int i = 0; i < 3; i++)
-        for (int j = 0; j < 3; j++) {
-            rows[i][j] = matrix[i][j] - (i == j ? mean : 0);
-            squared += rows[i][j] * rows[i][j];
-        }
-    const double size = larger64(sqrt(squared / 6), 1e-150);
-    for (int i = 0; i < 3; i++)
-        for (int j = 0; j < 3; j++) rows[i][j] /= size;
-    double normal[3];
-    cross(normal, rows[1], rows[2]);
-    const double half = dot(rows[0], normal) / 2;
-    const double angle = acos(half < -1 ? -1 : half > 1 ? 1 : half) / 3, third = 2.0943951023931953;
-    const double least = 2 * cos(angle + third);
-    eigenvalues[0] = mean + size * least;
-    eigenvalues[1] = mean + size * 2 * cos(angle + 2 * third);
-    eigenvalues[2] = mean + size * 2 * cos(angle);
-    for (int i = 0; i < 3; i++) rows[i][i] -= least;
-    double crosses[3][3], longest = -1;
-    int best = 0;
-    cross(crosses[0], rows[0], rows[1]);
-    cross(crosses[1], rows[0], rows[2]);
-    cross(crosses[2], rows[1], rows[2]);
-    for (int i = 0; i < 3; i++) {
-        const double length = sqrt(dot(crosses[i], crosses[i]));
-        if (length > longest) longest = length, best = i;
-    }
-    memcpy(vector, crosses[best], sizeof crosses[best]);
-    if (longest < 1e-12) { /* all rows lie along the one large eigenvalue's vector: any direction across it will do */
-        int along = 0, axis = 0;
-        for (int i = 1; i < 3; i++)
-            if (dot(rows[i], rows[i]) > dot(rows[along], rows[along])) along = i;
-        for (int i = 1; i < 3; i++)
-            if (fabs(rows[along][i]) < fabs(rows[along][axis])) axis = i;
-        double unit[3] = {0, 0, 0};
-        unit[axis] = 1;
-        cross(vector, rows[along], unit);
-        longest = sqrt(dot(vector, vector));
-    }
-    for (int i = 0; i < 3; i++) vector[i] /= larger64(longest, 1e-150);
 }
 
 INLINE void plane(const Neighbourhood *near, float *normal, float *shape) {
@@ -341,9 +277,14 @@ static ANY_PROCESSOR void talk(const Surroundings *around, int64_t start, int64_
     }
 }
 
-/* For Python, which gives arrays by their addresses (fused.py) and lets other threads go on meanwhile. */
+/* What sources say in a round, from their features. */
+static ANY_PROCESSOR void hear(const float *features, int64_t start, int64_t stop, const float *weight, float *heard) {
+    const Channels nothing = {{{0}}};
+    for (int64_t i = start; i < stop; i++)
+        store(heard + CHANNELS * i, layer(nothing, features + CHANNELS * i, CHANNELS, weight));
+}
 
-#define AT(type, address) ((type *)(uintptr_t)(address))
+/* For Python, which gives arrays by their addresses (fused.py) and lets other threads go on meanwhile. */
 
 static int surroundings(PyObject *given, void *into) {
     unsigned long long points, sources, index, count;
@@ -367,6 +308,17 @@ static PyObject *call_look(PyObject *self, PyObject *args) {
     Py_RETURN_NONE;
 }
 
+static PyObject *call_hear(PyObject *self, PyObject *args) {
+    unsigned long long features, weight, heard;
+    long long start, stop;
+    (void)self;
+    if (!PyArg_ParseTuple(args, "KLLKK", &features, &start, &stop, &weight, &heard)) return NULL;
+    Py_BEGIN_ALLOW_THREADS
+    hear(AT(float, features), start, stop, AT(float, weight), AT(float, heard));
+    Py_END_ALLOW_THREADS
+    Py_RETURN_NONE;
+}
+
 static PyObject *call_talk(PyObject *self, PyObject *args) {
     Surroundings around;
     unsigned long long normals, their_normals, rounds, heard, before, features, head, moves;
@@ -385,6 +337,7 @@ static PyObject *call_talk(PyObject *self, PyObject *args) {
 
 static PyMethodDef functions[] = {
     {"look", call_look, METH_VARARGS, "Planes and first features of some points."},
+    {"hear", call_hear, METH_VARARGS, "What some sources say in a round."},
     {"talk", call_talk, METH_VARARGS, "Rounds of messages of some points, and their step."},
     {NULL, NULL, 0, NULL},
 };

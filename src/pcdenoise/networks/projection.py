@@ -124,18 +124,6 @@ def point_features(graph: Edges, plane: Planes, noise: float) -> Tensor:
     return torch.stack([2 * thin, 2 * (wide - middle), 4 * level / (1 + level), thin / (thin + level + 1e-6)], dim=-1)
 
 
-def trust(plane: Planes, noise: float) -> Tensor:
-    """(M,) from 0, no surface here (foliage, wires, clutter), to 1: the noise explains how thick it is, or it is flat anyway.
-
-    On noisy surfaces 19 of 20 neighbourhoods are thinner than 1.5 std; a wire or a filled volume has a planarity,
-    (middle - thin) / wide, of about 0.2, a plane 0.7, the edge of a box 0.35.
-    """
-    thin, middle, wide = plane.shape.unbind(-1)
-    unexplained = ((thin / max(noise, 1e-30) - 1.5) / 0.7).clamp(0, 1)
-    flat = (((middle - thin) / wide.clamp_min(1e-30) - 0.15) / 0.2).clamp(0, 1)
-    return 1 - unexplained * (1 - flat)
-
-
 def edge_features(graph: Edges, own: Planes, theirs: Planes, noise: float) -> tuple[Tensor, Tensor, Tensor]:
     """(M, K, 8) invariants of each edge, and the signed heights a and b (M, K) that they are made of.
 

@@ -1,5 +1,7 @@
 """Model folders: weights (safetensors), config and card. Nothing is unpickled and no code comes from a file.
 
+Weights are arrays until somebody asks for the network itself: compiled inference (fused.py) does without torch.
+
 NAME/weights.safetensors   tensors, float32
 NAME/config.json           {"network": …, "settings": {…}, "training": {…}, "scores": {…}}
 NAME/README.md             the card: data, noise, seed, command, scores
@@ -9,12 +11,16 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from pcdenoise.errors import ModelError, in_one_line
@@ -25,6 +31,8 @@ if TYPE_CHECKING:
     from pcdenoise.networks.projection import ProjectionNetwork
 
 Network: TypeAlias = "ProjectionNetwork | MCConvNetwork"
+Weights: TypeAlias = Mapping[str, NDArray[Any]]
+"""Named as torch names the network's parameters and buffers."""
 
 WEIGHTS, CONFIG, CARD = "weights.safetensors", "config.json", "README.md"
 DEFAULT = "default"
@@ -37,7 +45,9 @@ class _Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class _ProjectionSettings(_Settings):
+class ProjectionSettings(_Settings):
+    """Those of `networks.projection.ProjectionConfig`."""
+
     channels: int = Field(ge=4, le=256)
     neighbours: int = Field(ge=6, le=256)
     rounds: tuple[Annotated[int, Field(ge=1, le=8)], ...] = Field(min_length=1, max_length=8)
@@ -57,7 +67,7 @@ class ModelConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     network: Literal["projection", "mcconv"]
-    settings: _ProjectionSettings | _MCConvSettings
+    settings: ProjectionSettings | _MCConvSettings
     summary: str = ""
     training: dict[str, Any] = Field(default_factory=dict)
     scores: dict[str, Any] = Field(default_factory=dict)
@@ -65,18 +75,32 @@ class ModelConfig(BaseModel):
     @field_validator("settings", mode="before")
     @classmethod
     def _of_the_network(cls, settings: Any, info: ValidationInfo) -> _Settings:
-        kinds: dict[Any, type[_Settings]] = {"projection": _ProjectionSettings, "mcconv": _MCConvSettings}
+        kinds: dict[Any, type[_Settings]] = {"projection": ProjectionSettings, "mcconv": _MCConvSettings}
         return kinds[info.data["network"]].model_validate(settings) if "network" in info.data else settings
 
 
 @dataclass(frozen=True)
 class Model:
-    """A network ready to run and where it came from. sha256: of the weights file."""
+    """A network's weights and where they came from. sha256: of the weights file."""
 
     name: str
-    network: Network
     config: ModelConfig
     sha256: str
+    weights: Weights
+
+    @classmethod
+    def of(cls, network: Network, name: str) -> Model:
+        """A model of a network that is in no file."""
+        return cls(name, _describe(network), "", _weights(network))
+
+    @cached_property
+    def network(self) -> Network:
+        """The network itself, ready to run. Imports torch."""
+        import torch
+
+        network = _build(self.config)
+        network.load_state_dict({name: torch.from_numpy(array.copy()) for name, array in self.weights.items()})
+        return network.eval()
 
 
 @dataclass(frozen=True)
@@ -103,46 +127,53 @@ def available() -> Iterator[ModelInfo]:
 def info(folder: Path) -> ModelInfo:
     """Reads a model folder's config and counts its parameters. Raises ModelError."""
     config = _read_config(folder)
-    network = _build(config)
-    return ModelInfo(folder.name, folder, config, sum(p.numel() for p in network.parameters()))
+    return ModelInfo(folder.name, folder, config, _n_parameters(config))
 
 
 def load(name_or_folder: str | Path = DEFAULT) -> Model:
     """The model in that folder, or of that name among the shipped ones. Raises ModelError when missing, damaged or tampered."""
     folder = _find(name_or_folder)
     config = _read_config(folder)
-    network = _build(config)
-    path = folder / WEIGHTS
-    data = _read(path)
-    from safetensors import SafetensorError
-    from safetensors.torch import load as parse
+    data = _read(folder / WEIGHTS)
+    return Model(folder.name, config, hashlib.sha256(data).hexdigest(), _parsed(data, config, folder / WEIGHTS))
 
+
+def _parsed(data: bytes, config: ModelConfig, path: Path) -> Weights:
+    """The arrays in a weights file, all of which are numbers of the kind and shape that the network has."""
+    from safetensors import SafetensorError, deserialize
+
+    again = "copy the model folder again"
     try:
-        tensors = parse(data)
+        found = dict(deserialize(data))  # type: ignore[no-untyped-call]
     except (SafetensorError, ValueError, KeyError) as fault:
-        raise ModelError(f"{path}: not a safetensors file ({in_one_line(fault)}); copy the model folder again") from None
-    types = {name: tensor.dtype for name, tensor in network.state_dict().items()}
-    for name, tensor in tensors.items():
-        if tensor.dtype != types.get(name, tensor.dtype):  # a conversion could make infinities of numbers
-            raise ModelError(f"{path}: {name} is {tensor.dtype}, not {types[name]}; copy the model folder again")
-    try:
-        network.load_state_dict(tensors)
-    except RuntimeError as fault:
-        raise ModelError(f"{path}: weights do not fit {CONFIG} ({in_one_line(fault)}); copy the model folder again") from None
-    if not all(bool(t.isfinite().all()) for t in tensors.values()):
-        raise ModelError(f"{path}: weights are not all numbers; copy the model folder again")
-    return Model(folder.name, network.eval(), config, hashlib.sha256(data).hexdigest())
+        raise ModelError(f"{path}: not a safetensors file ({in_one_line(fault)}); {again}") from None
+    expected = _expected(config)
+    if odd := sorted(found.keys() ^ expected.keys()):
+        raise ModelError(
+            f"{path}: weights do not fit {CONFIG} ({odd[0]} is {'too much' if odd[0] in found else 'missing'}); {again}"
+        )
+    weights = {}
+    for name, (shape, kind) in expected.items():
+        tensor = found[name]
+        if tensor["dtype"] != kind:  # a conversion could make infinities of numbers
+            raise ModelError(f"{path}: {name} is {tensor['dtype']}, not {kind}; {again}")
+        if tuple(tensor["shape"]) != shape:
+            raise ModelError(f"{path}: weights do not fit {CONFIG} ({name} is {tensor['shape']}, not {list(shape)}); {again}")
+        weights[name] = np.frombuffer(tensor["data"], _KINDS[kind]).reshape(shape)
+    if not all(np.isfinite(array).all() for array in weights.values()):
+        raise ModelError(f"{path}: weights are not all numbers; {again}")
+    return weights
 
 
 def save(
     network: Network, folder: Path, *, summary: str, training: Mapping[str, Any], scores: Mapping[str, Any], card: str
 ) -> None:
     """Writes a model folder; every file appears whole or not at all. Raises ModelError if one cannot be written."""
-    from safetensors.torch import save as serialise
+    from safetensors.numpy import save as serialise
 
     config = _describe(network).model_copy(update={"summary": summary, "training": dict(training), "scores": dict(scores)})
     files = {
-        WEIGHTS: serialise({name: tensor.detach().contiguous() for name, tensor in network.state_dict().items()}),
+        WEIGHTS: serialise(_weights(network)),
         CONFIG: (config.model_dump_json(indent=1) + "\n").encode(),
         CARD: card.encode(),
     }
@@ -200,3 +231,43 @@ def _build(config: ModelConfig) -> Network:
     if config.network == "mcconv":
         return MCConvNetwork(MCConvConfig(**settings))
     return ProjectionNetwork(ProjectionConfig(**settings))
+
+
+def _weights(network: Network) -> dict[str, NDArray[Any]]:
+    return {name: tensor.detach().contiguous().numpy().copy() for name, tensor in network.state_dict().items()}
+
+
+_KINDS = {"F32": np.float32, "I64": np.int64}
+_Expected: TypeAlias = dict[str, tuple[tuple[int, ...], str]]
+
+
+def _expected(config: ModelConfig) -> _Expected:
+    """Shape and kind of number of every array that such a network has."""
+    if isinstance(config.settings, ProjectionSettings):
+        return {name: (shape, "F32") for name, shape in _projection_shapes(config.settings)}
+    kinds = {np.dtype(number): kind for kind, number in _KINDS.items()}
+    return {name: (array.shape, kinds[array.dtype]) for name, array in _weights(_build(config)).items()}
+
+
+def _projection_shapes(sizes: ProjectionSettings) -> Iterator[tuple[str, tuple[int, ...]]]:
+    """What `ProjectionNetwork.state_dict` would say, without torch."""
+    c = sizes.channels
+    a_round = {
+        "edge.weight": (c, 8), "edge.bias": (c,), "own.weight": (c, c), "their.weight": (c, c), "message.weight": (c, c),
+        "message.bias": (c,), "update.weight": (c, 2 * c), "update.bias": (c,), "norm.weight": (c,), "norm.bias": (c,),
+    }  # fmt: skip
+    stages = {f"stages.{number}": rounds for number, rounds in enumerate(sizes.rounds)}
+    for stage, rounds in {**stages, "landing": sizes.landing_rounds}.items():
+        yield f"{stage}.embed.weight", (c, 4)
+        yield f"{stage}.embed.bias", (c,)
+        for number in range(rounds):
+            for name, shape in a_round.items():
+                yield f"{stage}.rounds.{number}.{name}", shape
+        yield f"{stage}.step.head.weight", (3, c)
+        yield f"{stage}.step.head.bias", (3,)
+
+
+def _n_parameters(config: ModelConfig) -> int:
+    if isinstance(config.settings, ProjectionSettings):
+        return sum(math.prod(shape) for _, shape in _projection_shapes(config.settings))
+    return sum(parameter.numel() for parameter in _build(config).parameters())

@@ -1,0 +1,128 @@
+"""What each network does in a pass: from points in spatial order to where it moves them.
+
+Torch is imported only where it is needed: by mcconv, and by the projection network where there is no compiled code for it.
+Not here: what is done about a pass (denoiser.py), the networks (networks).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from threading import Lock
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcdenoise.cloud.noise_level import NoiseLevel
+from pcdenoise.cloud.scan import Points
+from pcdenoise.denoising.seeds import coarsen, share_of_seeds
+from pcdenoise.networks import fused
+from pcdenoise.networks.store import Model, ProjectionSettings
+
+_DECODED_AT_ONCE = 65_536
+
+
+def projection(
+    points: Points,
+    identity: NDArray[np.uint64],
+    level: NoiseLevel,
+    model: Model,
+    seed: int,
+    threads: int,
+    on_share: Callable[[float], None],
+) -> Points:
+    """Coarse to fine in O(N·K): seeds find the surface, all points land on it, as far as there is one.
+
+    identity (N,): what seeds are drawn by.
+    """
+    sizes = model.config.settings
+    assert isinstance(sizes, ProjectionSettings)
+    share = share_of_seeds(level, sizes.neighbours)
+    seeds, count, cell, raw = points, None, np.arange(len(points)), None
+    if share < 1:
+        coarse = coarsen(points, share, seed, threads, identity)
+        seeds, count, cell, raw = coarse.points, coarse.count, coarse.cell, points
+    total = len(seeds) * sum(sizes.rounds) + (len(points) * sizes.landing_rounds if share < 1 else 0)
+    done, counting = 0, Lock()
+
+    def on_block(n: int) -> None:
+        nonlocal done
+        with counting:
+            done += n
+            on_share(done / total)
+
+    if fused.fits(sizes):
+        given = (model.weights, sizes, seeds, count, raw, level.std)
+        moved, shape = fused.descend(*given, threads=threads, on_block=on_block)
+    else:
+        moved, shape = _in_torch(model, seeds, count, raw, level.std, threads, on_block)
+    return points + trust(shape, level.std)[cell, None] * (moved - points)
+
+
+def trust(shape: NDArray[np.float32], noise: float) -> NDArray[np.float64]:
+    """(M,) from 0, no surface here (foliage, wires, clutter), to 1: the noise explains how thick it is, or it is flat anyway.
+
+    shape (M, 3): ascending standard deviations of neighbourhoods along their axes. On noisy surfaces 19 of 20 are thinner than
+    1.5 std; a wire or a filled volume has a planarity, (middle - thin) / wide, of about 0.2, a plane 0.7, the edge of a box 0.35.
+    """
+    thin, middle, wide = shape.astype(np.float64).T
+    unexplained = np.clip((thin / max(noise, 1e-30) - 1.5) / 0.7, 0, 1)
+    flat = np.clip(((middle - thin) / np.maximum(wide, 1e-30) - 0.15) / 0.2, 0, 1)
+    trusted: NDArray[np.float64] = 1 - unexplained * (1 - flat)
+    return trusted
+
+
+def _in_torch(
+    model: Model,
+    seeds: Points,
+    count: NDArray[np.float64] | None,
+    raw: Points | None,
+    noise: float,
+    threads: int,
+    on_block: Callable[[int], None],
+) -> tuple[Points, NDArray[np.float32]]:
+    import torch
+
+    from pcdenoise.denoising.pyramid import descend
+    from pcdenoise.networks.projection import ProjectionNetwork
+
+    assert isinstance(model.network, ProjectionNetwork)
+    with _torch_threads(1), torch.no_grad():  # of blocks, which are spread over threads already
+        descent = descend(model.network, seeds, count, raw, noise, threads=threads, on_block=on_block)
+    landed = descent.seeds[-1] if descent.landed is None else descent.landed
+    return landed.numpy(), descent.shape.numpy()
+
+
+def mcconv(points: Points, unit: float, model: Model, seed: int, threads: int, on_share: Callable[[float], None]) -> Points:
+    """In the network's frame. Only the first level, which is small, is looked at as a whole; the points follow in blocks.
+
+    unit: what the network takes for one, in the points' unit.
+    """
+    import torch
+
+    from pcdenoise.networks.mcconv import MCConvNetwork
+
+    network, rng = model.network, np.random.default_rng(seed)
+    assert isinstance(network, MCConvNetwork)
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    local = torch.from_numpy((points - centre) / unit)
+    moves = []
+    with _torch_threads(threads), torch.no_grad():
+        code = network.encode(local, rng)
+        for start in range(0, len(points), _DECODED_AT_ONCE):
+            moves.append(network.decode(code, local[start : start + _DECODED_AT_ONCE], rng).double().numpy())
+            on_share(min((start + _DECODED_AT_ONCE) / len(points), 1.0))
+    return fused.numbers(points + unit * np.concatenate(moves))
+
+
+@contextmanager
+def _torch_threads(number: int) -> Iterator[None]:
+    """Torch with so many threads of its own."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(number)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
