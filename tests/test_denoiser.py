@@ -24,7 +24,6 @@ from pcdenoise.denoising.held_out import HeldOut
 from pcdenoise.denoising.seeds import share_of_seeds
 from pcdenoise.errors import ModelError, UsageError
 from pcdenoise.networks import fused, store
-from pcdenoise.networks.mcconv import MCConvNetwork
 from pcdenoise.networks.store import Model
 
 PLAIN = DenoiseConfig(threads=1)
@@ -367,9 +366,8 @@ def test_mcconv_runs_by_the_same_rules(rng: np.random.Generator) -> None:
 def test_a_unit_of_length_goes_with_the_model_not_with_the_cloud() -> None:
     noisy = cloud("sphere", 1500, 1.0).noisy
     known = model("mcconv")
-    network = MCConvNetwork(replace(known.network.config, unit=float(np.linalg.norm(np.ptp(noisy, axis=0))))).eval()
-    network.load_state_dict(known.network.state_dict())
-    in_metres = replace(known, network=network)
+    settings = known.config.settings.model_copy(update={"unit": float(np.linalg.norm(np.ptp(noisy, axis=0)))})
+    in_metres = replace(known, config=known.config.model_copy(update={"settings": settings}))
     np.testing.assert_allclose(denoise(noisy, in_metres, PLAIN).points, clean(noisy, "mcconv").points, atol=1e-9)
     # A second cloud far away makes the diagonal longer and leaves the unit as it is.
     two = np.concatenate([noisy, noisy + [100.0, 0, 0]])
