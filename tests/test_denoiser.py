@@ -18,7 +18,7 @@ from pcdenoise import io
 from pcdenoise.cloud.neighbours import coordinate_hash, knn
 from pcdenoise.cloud.noise_level import estimate
 from pcdenoise.config import DenoiseConfig
-from pcdenoise.denoising import denoiser, pyramid
+from pcdenoise.denoising import network_pass, pyramid
 from pcdenoise.denoising.denoiser import Result, denoise, iterate
 from pcdenoise.denoising.held_out import HeldOut
 from pcdenoise.denoising.seeds import share_of_seeds
@@ -379,7 +379,7 @@ def test_a_unit_of_length_goes_with_the_model_not_with_the_cloud() -> None:
 def test_decoding_in_blocks_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     noisy = cloud("torus", 1500, 0.5).noisy
     whole = clean(noisy, "mcconv").points
-    monkeypatch.setattr(denoiser, "_DECODED_AT_ONCE", 400)
+    monkeypatch.setattr(network_pass, "_DECODED_AT_ONCE", 400)
     np.testing.assert_allclose(clean(noisy, "mcconv").points, whole, atol=1e-5)
 
 
