@@ -25,7 +25,7 @@ from pcdenoise.cloud.noise_level import estimate
 from pcdenoise.cloud.scan import Points
 from pcdenoise.config import DenoiseConfig, TrainConfig
 from pcdenoise.denoising import classical, denoiser
-from pcdenoise.denoising.held_out import HeldOut
+from pcdenoise.denoising.risk import Risk
 from pcdenoise.evaluation.chamfer import point_errors
 from pcdenoise.learning.scans import noisy_and_clean
 from pcdenoise.learning.trainer import train
@@ -111,31 +111,31 @@ class Lab:
     def passes(self, subject: Subject, seed: int, points: Points) -> tuple[list[Points], int]:
         """A cloud before the first and after every pass, and after which one the automatic stop, which has no truth, stops."""
         steps = self._patch_steps(subject, seed, points) if subject.method == "pointnet" else self._steps(subject, seed, points)
-        clouds, least, auto, spacing, goes_on = [points], np.inf, 0, estimate(points, seed, self.threads).spacing, True
-        for moved, residual in steps:
+        clouds, auto, spacing, goes_on = [points], 0, estimate(points, seed, self.threads).spacing, True
+        for moved, before, after in steps:
             clouds.append(moved)
-            goes_on = goes_on and denoiser.is_worthwhile(residual, least, spacing)
-            if goes_on:
-                auto, least = auto + 1, residual
+            goes_on = goes_on and denoiser.is_worthwhile(before, after, spacing)
+            auto += goes_on
         return clouds, auto
 
-    def _steps(self, subject: Subject, seed: int, points: Points) -> Iterator[tuple[Points, float]]:
+    def _steps(self, subject: Subject, seed: int, points: Points) -> Iterator[tuple[Points, float, float]]:
         model, settings = None, {}
         if subject.method in TRAINED:
             model = store.load(str(self.model(subject, seed)))
         else:
             settings = {"method": subject.method, **self.tuned(subject, seed)}
         config = DenoiseConfig(iters=self.scale.passes, seed=seed, threads=self.threads, **settings)
-        return ((step.points, step.figures["held_out"]) for step in denoiser.iterate(points, model, config))
+        steps = denoiser.iterate(points, model, config)
+        return ((step.points, step.figures["error_before"], step.figures["error_after"]) for step in steps)
 
-    def _patch_steps(self, subject: Subject, seed: int, points: Points) -> Iterator[tuple[Points, float]]:
+    def _patch_steps(self, subject: Subject, seed: int, points: Points) -> Iterator[tuple[Points, float, float]]:
         """As `denoiser.iterate` goes, for a network that pcdenoise does not know."""
         network, diagonal = PatchNet(), float(np.linalg.norm(np.ptp(points, axis=0)))
         network.load_state_dict(torch.load(self.model(subject, seed) / "weights.pt", weights_only=True))
-        held_out = HeldOut(points, coordinate_hash(points, 0), estimate(points, seed, self.threads), seed, self.threads)
+        risk = Risk(points, coordinate_hash(points, 0), estimate(points, seed, self.threads), seed, self.threads)
         for _ in range(self.scale.passes):
-            points = one_pass(network, points, diagonal)
-            yield points, held_out.after(lambda half: one_pass(network, half, diagonal))
+            before, after = risk.after(lambda some: one_pass(network, some, diagonal))
+            yield risk.points, before, after
 
     def tuned(self, subject: Subject, seed: int) -> dict[str, float]:
         """Settings of a filter that are best on the training set."""

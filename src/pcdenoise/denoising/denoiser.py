@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from pcdenoise.cloud import drift
 from pcdenoise.cloud.neighbours import coordinate_hash, distinct_by, drawn_by, spatial_order
-from pcdenoise.cloud.noise_level import NoiseLevel, estimate, estimate_at, probes
+from pcdenoise.cloud.noise_level import NoiseLevel, estimate_at, probes
 from pcdenoise.cloud.scan import Mask, Points, check_extent, within
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import classical, network_pass, outliers, uncertainty
-from pcdenoise.denoising.held_out import HeldOut
 from pcdenoise.denoising.relaxation import relax, without_low_frequencies
+from pcdenoise.denoising.risk import Risk
 from pcdenoise.errors import UsageError
 from pcdenoise.networks.store import Model, ProjectionSettings
 
@@ -34,10 +34,10 @@ _SHRINKING = 0.035
 """Radius over which moves that all points share are taken back, in the network's units of length; as released."""
 _FURTHEST_STDS = 5.0
 """Longest move of one pass along the normal: what is further from the surface is no noise but an outlier or another thing."""
-_WORTHWHILE = 2e-4
-"""`auto` goes on while a pass lowers the residual over held-out points by this share; see docs/decisions/paper.md."""
+_WORTHWHILE = 2e-3
+"""`auto` goes on while a pass lowers the estimated error by this share; see docs/decisions/paper.md."""
 _NOTHING = 1e-6
-"""Of the spacing: a residual that falls by less is that of a cloud without noise."""
+"""Of the spacing: an error that falls by less is that of a cloud without noise."""
 
 Identity = NDArray[np.uint64]
 """(N,) the `coordinate_hash` of where points were in the file: a part of a cloud draws by it as the whole does, in any pass."""
@@ -47,10 +47,10 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Step:
-    """The cloud after one pass, and its figures: iteration, move_median, move_max, roughness_before, roughness_after, held_out.
+    """The cloud after one pass, and its figures: iteration, move_median, move_max, roughness_before, roughness_after.
 
-    held_out, where it was looked at, is the residual of `held_out.HeldOut`: noise and error together. Roughness is the estimated
-    noise: what neighbours disagree by. After a pass it says how smooth the cloud is, not how far it still is from the truth.
+    error_before and error_after, where they were looked at, are those of `risk.Risk`. Roughness is the estimated noise: what
+    neighbours disagree by. After a pass it says how smooth the cloud is, not how far it still is from the truth.
     """
 
     points: Points
@@ -192,37 +192,36 @@ def most_passes(n_points: int, level: NoiseLevel, config: DenoiseConfig) -> int:
     return _MOST_PASSES if config.iters == "auto" else config.iters
 
 
-def is_worthwhile(residual: float, least: float, spacing: float) -> bool:
-    """Whether a pass that left this residual over held-out points is one that `auto` makes: `least` is the best one before it.
-
-    All in the points' unit; `least` is infinite before the first pass.
-    """
-    return residual <= (1 - _WORTHWHILE) * least - _NOTHING * spacing
+def is_worthwhile(before: float, after: float, spacing: float) -> bool:
+    """Whether a pass with these estimated errors before and after it is one that `auto` makes. All in the points' unit."""
+    return after <= (1 - _WORTHWHILE) * before - _NOTHING * spacing
 
 
 class Judge:
-    """Held-out points and what they say of pass after pass. Which passes are worth making is theirs to say under `auto`."""
+    """Points that stand for a cloud, and what they say of pass after pass. Under `auto` they say which are worth making."""
 
     def __init__(
-        self, held_out: HeldOut, level: NoiseLevel, diagonal: float, model: Model | None, config: DenoiseConfig, threads: int
+        self, risk: Risk, level: NoiseLevel, diagonal: float, model: Model | None, config: DenoiseConfig, threads: int
     ) -> None:
-        self._held_out, self._least = held_out, np.inf
-        self._spacing = level.spacing
+        self._risk, self._spacing = risk, level.spacing
         self._model, self._config, self._diagonal, self._threads = model, config, diagonal, threads
 
-    def residual(self) -> float | None:
-        """The residual after one more pass; None where `auto` makes it no more."""
+    @property
+    def points(self) -> Points:
+        """(N, 3) where the passes so far led them."""
+        return self._risk.points
 
-        def fresh_pass(points: Points) -> Points:  # over points whose noise nobody has measured yet
-            level = estimate(points, self._config.seed, self._threads)
-            identity = self._held_out.identity
-            return one_pass(points, identity, level, self._diagonal, self._model, self._config, self._threads)
+    def figures(self, level: NoiseLevel, on_share: Callable[[float], None] = lambda _share: None) -> dict[str, float] | None:
+        """The estimated errors around one more pass over a cloud of that level; None where `auto` makes it no more."""
 
-        found = self._held_out.after(fresh_pass)
-        if self._config.iters == "auto" and not is_worthwhile(found, self._least, self._spacing):
+        def next_pass(points: Points) -> Points:
+            identity = self._risk.identity
+            return one_pass(points, identity, level, self._diagonal, self._model, self._config, self._threads, on_share)
+
+        before, after = self._risk.after(next_pass)
+        if self._config.iters == "auto" and not is_worthwhile(before, after, self._spacing):
             return None
-        self._least = found
-        return found
+        return {"error_before": before, "error_after": after}
 
 
 def _passes(
@@ -230,23 +229,23 @@ def _passes(
 ) -> Iterator[Step]:
     """Every pass goes on from where the last one led, not from what strength and limit leave of it.
 
-    `is_judged`: each pass is also made on half of the points and judged by the other half, as `auto` does anyway.
+    `is_judged`: the error before and after each pass is estimated, as `auto` does anyway, at the cost of another pass.
     """
     points, level, judge = cloud.start, cloud.level, None
     n_passes = most_passes(len(points), level, config)
     if n_passes and (config.iters == "auto" or is_judged):
-        held_out = HeldOut(points, cloud.identity, level, config.seed, cloud.threads)
-        judge = Judge(held_out, level, cloud.diagonal, model, config, cloud.threads)
+        risk = Risk(points, cloud.identity, level, config.seed, cloud.threads)
+        judge = Judge(risk, level, cloud.diagonal, model, config, cloud.threads)
     for number in range(1, n_passes + 1):
         task = "cleaning" if config.iters == 1 else f"pass {number}"
-        judgement = {}
-        if judge is not None:
-            residual = judge.residual()
-            if residual is None:
-                return
-            judgement = {"held_out": residual}
         on_share = partial(on_progress, task)
-        moved = one_pass(points, cloud.identity, level, cloud.diagonal, model, config, cloud.threads, on_share)
+        judgement = judge.figures(level, on_share) if judge is not None else {}
+        if judgement is None:
+            return
+        if judge is not None and len(judge.points) == len(points):
+            moved = judge.points
+        else:
+            moved = one_pass(points, cloud.identity, level, cloud.diagonal, model, config, cloud.threads, on_share)
         after = estimate_at(moved, cloud.probes, cloud.threads)
         length = np.linalg.norm(moved - points, axis=1)
         figures = {

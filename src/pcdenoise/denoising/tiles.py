@@ -36,7 +36,7 @@ from pcdenoise.cloud.neighbours import Distances, NeighbourSearch, coordinate_ha
 from pcdenoise.cloud.noise_level import N_PROBES, NoiseLevel, estimate_from
 from pcdenoise.cloud.scan import Mask, Points, check_extent
 from pcdenoise.config import DenoiseConfig
-from pcdenoise.denoising import classical, denoiser, held_out, outliers, uncertainty
+from pcdenoise.denoising import classical, denoiser, outliers, risk, uncertainty
 from pcdenoise.denoising.denoiser import Identity, Progress
 from pcdenoise.denoising.seeds import share_of_seeds
 from pcdenoise.networks.store import Model
@@ -198,7 +198,7 @@ class Tiles:
         judge = self._judge(first) if most and self.config.iters == "auto" else None
         for number in range(1, most + 1):
             task = "cleaning" if self.config.iters == 1 else f"pass {number}"
-            if judge is not None and judge.residual() is None:
+            if judge is not None and judge.figures(level) is None:
                 break
             for cell in self.cells:
                 self.clean(cell, number, level)
@@ -317,9 +317,9 @@ class Tiles:
             margin *= 2
 
     def _judge(self, level: NoiseLevel) -> denoiser.Judge:
-        """The held-out points of the whole cloud: those nearest to the first of all probes, as in memory."""
+        """The points that stand for the whole cloud: those nearest to the first of all probes, as in memory."""
         centre = np.array(self.plan["probes"][0])
-        most = min(held_out.MOST_POINTS, self.plan["n_distinct"])
+        most = min(risk.MOST_POINTS, self.plan["n_distinct"])
         part = self._part(int(_cell_of(centre[None], self.plan["cuts"])[0]), 0)
         cell = int(_cell_of(centre[None], self.plan["cuts"])[0])
         margin = max(float(np.ptp(part.points, axis=0).max()), 1e-12)
@@ -333,8 +333,8 @@ class Tiles:
             nearest = np.argpartition(distance, most)[:most]
             tile = _Part(tile.points[nearest], tile.identity[nearest])
         order = spatial_order(tile.points)
-        halves = held_out.HeldOut(tile.points[order], tile.identity[order], level, self.config.seed, self.threads)
-        return denoiser.Judge(halves, level, self.plan["diagonal"], self.model, self.config, self.threads)
+        some = risk.Risk(tile.points[order], tile.identity[order], level, self.config.seed, self.threads)
+        return denoiser.Judge(some, level, self.plan["diagonal"], self.model, self.config, self.threads)
 
     def _drift(self, cell: int, number: int) -> tuple[int, float, float]:
         """How many points a cell has, and how far its surface moved in all passes, at all and inward."""

@@ -44,11 +44,11 @@ Report = Mapping[str, Any]
 _WORDS = {
     "move_median": "move, median", "move_p95": "move, 95 % below", "move_p99": "move, 99 % below", "move_max": "move, longest",
     "is_surface": "shows a surface", "drift_inward": "drift, inward", "roughness_before": "scatter before",
-    "roughness_after": "scatter after", "held_out": "residual of held-out points", "iters": "passes", "iterations": "passes",
+    "roughness_after": "scatter after", "iters": "passes", "iterations": "passes",
     "cd": "Chamfer distance (1e-4, unit sphere)", "p2s": "to the surface (1e-4, unit sphere)",
     "p2m": "to and from the surface (1e-4, unit sphere)", "td": "Total Denoising's error (% of the diagonal)",
     "shrinkage": "shrinkage (% of the diagonal)", "normal_error": "error of normals (\u00b0)",
-    "cpu_s": "CPU (s)",
+    "error_before": "error before", "error_after": "error after", "cpu_s": "CPU (s)",
 }  # fmt: skip
 """How a page says what JSON calls so."""
 _UNITS = {"m": "m", "mm": "mm", "s": "s", "percent": "%", "mb": "MB", "deg": "\u00b0"}
