@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted((ROOT / "src" / "pcdenoise").rglob("*.py"))
 COMMANDS = ["denoise", "info", "bench", "iterate", "verify", "undo", "models", "synth", "train", "eval-chamfer"]
-HEAVY = {"torch", "open3d", "scipy", "laspy", "plyfile", "safetensors", "numpy", "pydantic"}
+HEAVY = {"torch", "open3d", "scipy", "laspy", "plyfile", "safetensors", "numpy", "pydantic", "markdown_it"}
 
 _REPORT_MODULES = """
 import sys

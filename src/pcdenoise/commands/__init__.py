@@ -20,6 +20,7 @@ import typer
 
 from pcdenoise import __version__
 from pcdenoise.commands import options
+from pcdenoise.commands.help import import_rich_help
 from pcdenoise.errors import PcdenoiseError, of_the_system
 
 EXIT_CODES = """\
@@ -93,6 +94,8 @@ def _pcdenoise(
 
 def _run(arguments: Sequence[str]) -> Any:
     """A command that is named first is all there is: other commands take time to be imported, Typer's group imports pydantic."""
+    if not arguments or not {"-h", "--help"}.isdisjoint(arguments):
+        import_rich_help()
     if arguments and arguments[0] in _SUMMARIES:
         alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
         _import_into(alone, arguments[0])
