@@ -27,7 +27,7 @@ def pages() -> dict[Path, str]:
 
 def commands() -> str:
     """Every command with its options."""
-    group: Any = typer.main.get_command(app)
+    group: Any = typer.main.get_command(app())
     parts = [
         "# Commands",
         WRITTEN,

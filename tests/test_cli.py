@@ -385,3 +385,13 @@ def test_cleaning_does_without_torch_and_a_wrong_model_writes_nothing(run: Run, 
     command = [sys.executable, "-c", order, "denoise", str(milk), "-o", str(tmp_path / "o.pcd"), "-q", "--uncertainty"]
     done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT / "src")})
     assert done.stdout.split() == ["False"], done.stderr
+
+
+@pytest.mark.parametrize(
+    ("line", "found"), [("pcdenoise ", {"denoise", "eval-chamfer"}), ("pcdenoise denoise --max-", {"--max-move", "--max-memory"})]
+)
+def test_a_shell_completes_commands_and_their_options(line: str, found: set[str]) -> None:
+    typed = {"COMP_WORDS": line, "COMP_CWORD": str(line.count(" ")), "_PCDENOISE_COMPLETE": "complete_bash"}
+    environment = {**os.environ, **typed, "PYTHONPATH": str(ROOT / "src")}
+    done = subprocess.run([sys.executable, "-m", "pcdenoise"], capture_output=True, text=True, env=environment)
+    assert found <= set(done.stdout.split()), done.stderr

@@ -112,13 +112,13 @@ def test_the_pages_build_without_a_warning(tmp_path: Path) -> None:
     assert (tmp_path / "site" / "tutorial" / "index.html").exists()
 
 
-def test_every_command_and_every_option_has_help() -> None:
+def test_every_command_and_every_option_has_help_and_the_list_of_commands_says_the_same() -> None:
     import typer.main
 
-    from pcdenoise.commands import app
+    from pcdenoise.commands import _SUMMARIES, app
 
-    for name, command in typer.main.get_command(app).commands.items():  # type: ignore[attr-defined]
-        assert command.help, name
+    for name, command in typer.main.get_command(app()).commands.items():  # type: ignore[attr-defined]
+        assert command.help.split("\n\n")[0] == _SUMMARIES[name], name
         for parameter in command.params:
             assert parameter.help, f"{name} {parameter.name}"
 

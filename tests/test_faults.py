@@ -197,13 +197,13 @@ def test_the_longest_and_oddest_names_can_be_written(name: str, tmp_path: Path) 
 
 
 def test_a_second_kill_does_not_disturb_the_tidying_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    def killed(**_: object) -> None:
+    def killed(_: object) -> None:
         try:
             os.kill(os.getpid(), signal.SIGTERM)
         finally:
             os.kill(os.getpid(), signal.SIGTERM)
 
-    monkeypatch.setattr("pcdenoise.commands.app", killed)
+    monkeypatch.setattr("pcdenoise.commands._run", killed)
     with pytest.raises(SystemExit) as stop:
         main([])
     assert stop.value.code == 143
@@ -220,10 +220,10 @@ def test_a_signal_while_a_library_makes_its_classes_is_no_bug(
         def __set_name__(self, owner: type, name: str) -> None:
             os.kill(os.getpid(), number)
 
-    def loads(**_: object) -> None:
+    def loads(_: object) -> None:
         type("Library", (), {"slow": Slow()})
 
-    monkeypatch.setattr("pcdenoise.commands.app", loads)
+    monkeypatch.setattr("pcdenoise.commands._run", loads)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         found: object = main([])
@@ -240,7 +240,7 @@ def test_a_signal_while_a_library_makes_its_classes_is_no_bug(
 def test_a_signal_that_was_ignored_stays_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
     try:
-        monkeypatch.setattr("pcdenoise.commands.app", lambda **_: os.kill(os.getpid(), signal.SIGHUP))
+        monkeypatch.setattr("pcdenoise.commands._run", lambda _: os.kill(os.getpid(), signal.SIGHUP))
         assert main([]) == 0
     finally:
         signal.signal(signal.SIGHUP, before)

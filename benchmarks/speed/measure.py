@@ -74,16 +74,15 @@ def main() -> None:
             found = run([sys.executable, "-m", "pcdenoise", "train", "-o", str(model), "--steps", str(steps), "-q"])
             rows.append(report(TRAIN, steps, found, "clouds"))
     options.output.mkdir(parents=True, exist_ok=True)
-    machine = {"cpu": cpu_name(), "cores": os.cpu_count(), "python": platform.python_version(), "system": platform.platform()}
-    done = {"pcdenoise": __version__, "machine": machine, "load_before": load_before, "rows": rows}
+    done = {"pcdenoise": __version__, "machine": machine(), "load_before": load_before, "rows": rows}
     (options.output / "speed.json").write_text(json.dumps(done, indent=1) + "\n")
     write_png(options.output / "speed.png", picture(rows), overwrite=True)
 
 
-def run(command: list[str]) -> dict[str, Any]:
+def run(command: list[str], environment: dict[str, str] | None = None) -> dict[str, Any]:
     """CPU seconds, wall seconds and peak memory of a process and its exit code; what it printed."""
     started = time.perf_counter()
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment)
     assert process.stdout is not None
     assert process.stderr is not None
     printed, complaint = process.stdout.read(), process.stderr.read()
@@ -120,6 +119,11 @@ def picture(rows: list[dict[str, Any]]) -> np.ndarray:
         series[row["name"]][sizes.index(row["n"])] = row["per_cpu_s"] / 1000
     places = np.log10(sizes)
     return curve(series, title="Speed", label="1000 points / CPU s", x_label="log10 points", x=places).image()
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were measured on."""
+    return {"cpu": cpu_name(), "cores": os.cpu_count(), "python": platform.python_version(), "system": platform.platform()}
 
 
 def cpu_name() -> str:

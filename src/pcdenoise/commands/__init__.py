@@ -1,6 +1,7 @@
 """The command line: one file per command, put together here with the one place where errors become exit codes.
 
-Command modules import the rest of pcdenoise inside their functions, so that --help and completion load neither numpy nor torch.
+A command's module is imported when the command is called, and imports the rest of pcdenoise inside its functions, so that
+--help loads neither other commands nor numpy.
 """
 
 from __future__ import annotations
@@ -8,8 +9,9 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from io import TextIOWrapper
 from types import FrameType
 from typing import Annotated, Any, NoReturn
@@ -17,22 +19,8 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from pcdenoise import __version__
-from pcdenoise.commands import (
-    bench,
-    denoise,
-    eval_chamfer,
-    info,
-    iterate,
-    models,
-    options,
-    pairs,
-    split,
-    synth,
-    train,
-    tune,
-    undo,
-    verify,
-)
+from pcdenoise.commands import options
+from pcdenoise.commands.help import import_rich_help
 from pcdenoise.errors import PcdenoiseError, of_the_system
 
 EXIT_CODES = """\
@@ -42,27 +30,51 @@ Exit codes: 0 done · 1 some inputs of a batch failed · 2 usage · 3 unreadable
 INTERRUPTED = 130
 READER_GONE = 141
 
-app = typer.Typer(name="pcdenoise", no_args_is_help=True, pretty_exceptions_enable=False, epilog=EXIT_CODES)
-
-_COMMANDS: dict[str, Callable[..., None]] = {
-    "denoise": denoise.denoise,
-    "info": info.info,
-    "bench": bench.bench,
-    "iterate": iterate.iterate,
-    "verify": verify.verify,
-    "undo": undo.undo,
-    "models": models.models,
-    "synth": synth.synth,
-    "split": split.split,
-    "train": train.train,
-    "tune": tune.tune,
-    "pairs": pairs.pairs,
-    "eval-chamfer": eval_chamfer.eval_chamfer,
+_SUMMARIES = {
+    "denoise": "Move noisy points to the surface they were measured on.",
+    "info": "Say what scans are and how noisy: extent, spacing, density, noise and where it is, traps, and how to clean them.",
+    "bench": "Compare our models with mean, bilateral, jet and Open3D's smoothers on your own scan, in one table.",
+    "iterate": "Write the scan after every pass, with a table, a strip of pictures (passes.png) and a page with a 3D viewer"
+    " (report.html).",
+    "verify": "Prove that every row and attribute survived, byte for byte, and say how far points moved. Exit code 5 if not.",
+    "undo": "Take a cleaned scan back to the original, exactly; needs a scan written by denoise --displacement.",
+    "models": "List the models that ship, or print one's card: training data, noise, scores, licence.",
+    "synth": "Make a data set: each surface as an evenly spaced clean cloud with colours, a noisy cloud per level, and its mesh.",
+    "split": "Cut scans to compact parts of a bounded size; rows keep their order and everything they carry.",
+    "train": "Train a model. Ctrl-C keeps what was learned so far.",
+    "tune": "Find the parameters with which a classical filter comes nearest to the clean clouds of a data set.",
+    "pairs": "Write noisy clouds with samples that may pass for clean ones, row for row, to train any supervised denoiser"
+    " without truth.",
+    "eval-chamfer": "Measure results against a clean cloud, a mesh, or both; the last row is the mean over several results.",
 }
-_SETTINGS: dict[str, Any] = {"auto_envvar_prefix": options.ENVIRONMENT_PREFIX, "help_option_names": ["-h", "--help"]}
+"""Every command in the order of --help, with the first paragraph of its own help."""
 
-for _name, _function in _COMMANDS.items():
-    app.command(_name, context_settings=_SETTINGS, no_args_is_help=_name != "models")(_function)
+_HELP: dict[str, Any] = {"help_option_names": ["-h", "--help"]}
+_COMPLETION = "_PCDENOISE_COMPLETE"
+
+
+def app(imported: Collection[str] = tuple(_SUMMARIES)) -> typer.Typer:
+    """All commands; those that are not imported are a name and a summary, which is what --help shows of them."""
+    group = typer.Typer(name="pcdenoise", no_args_is_help=True, pretty_exceptions_enable=False, epilog=EXIT_CODES)
+    group.callback(context_settings=_HELP)(_pcdenoise)
+    for name, summary in _SUMMARIES.items():
+        if name in imported:
+            _import_into(group, name)
+        else:
+            group.command(name, help=summary)(_not_imported)
+    return group
+
+
+def _import_into(group: typer.Typer, name: str) -> None:
+    """Adds the command that is the function of this name in the module of this name."""
+    word = name.replace("-", "_")
+    settings = {**_HELP, "auto_envvar_prefix": options.ENVIRONMENT_PREFIX}
+    add = group.command(name, context_settings=settings, no_args_is_help=name != "models")
+    add(getattr(import_module(f"{__name__}.{word}"), word))
+
+
+def _not_imported() -> None:
+    raise AssertionError("a command is imported before it is called")
 
 
 def _print_version(wanted: bool) -> None:
@@ -71,7 +83,6 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback(context_settings={"help_option_names": ["-h", "--help"]})
 def _pcdenoise(
     version: Annotated[
         bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version.")
@@ -81,12 +92,24 @@ def _pcdenoise(
     del version
 
 
+def _run(arguments: Sequence[str]) -> Any:
+    """A command that is named first is all there is: other commands take time to be imported, Typer's group imports pydantic."""
+    if not arguments or not {"-h", "--help"}.isdisjoint(arguments):
+        import_rich_help()
+    if arguments and arguments[0] in _SUMMARIES:
+        alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+        _import_into(alone, arguments[0])
+        return alone(args=arguments[1:], prog_name=f"pcdenoise {arguments[0]}", standalone_mode=False)
+    imported = _SUMMARIES if _COMPLETION in os.environ else set(arguments)
+    return app(imported)(args=arguments, prog_name="pcdenoise", standalone_mode=False)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line and returns its exit code. Expected errors become one line on stderr; bugs keep their traceback."""
     _replace_closed_streams()
     with _polite_kills():
         try:
-            code = app(args=arguments, prog_name="pcdenoise", standalone_mode=False)
+            code = _run(sys.argv[1:] if arguments is None else arguments)
             sys.stdout.flush()
             return _fail("interrupted; nothing is half-written", INTERRUPTED) if code == INTERRUPTED else int(code or 0)
         except PcdenoiseError as error:

@@ -158,7 +158,7 @@ def denoise(
     refuse_model(model, settings)
     cleaning = _Cleaning(
         settings, chosen, model, console, format, overwrite or is_far, drop_attributes, displacement,
-        max_drift, pictures, n_bytes(max_memory) // workers, tile, colour,
+        max_drift, pictures, n_bytes(max_memory) // workers, tile, colour, report is not None,
     )  # fmt: skip
     if len(jobs) > 1 or is_far:
         _ = cleaning.model  # one that is missing ends the run here, not each of its inputs
@@ -221,6 +221,7 @@ class _Cleaning:
     max_bytes: int
     tile: int | None = None
     colour: bool = False
+    is_reported: bool = False
     pages: list[Page] = field(default_factory=list)
 
     @cached_property
@@ -311,7 +312,6 @@ class _Cleaning:
         from pcdenoise.commands.survey import traps, unit_of
         from pcdenoise.denoising import denoiser
         from pcdenoise.denoising.part import denoise_part
-        from pcdenoise.evaluation.report import Page
 
         started = time.perf_counter()
         self.console.detail(f"{job.source}: reading")
@@ -335,7 +335,10 @@ class _Cleaning:
             outputs.save_before_after(
                 picture, scan, result.points, notes=picture_notes(result, unit), unit=unit, overwrite=self.overwrite
             )
-        self.pages[:] = [Page(scan.points, result.points, colours=outputs.colours(scan), unit=unit)]
+        if self.is_reported:
+            from pcdenoise.evaluation.report import Page
+
+            self.pages[:] = [Page(scan.points, result.points, colours=outputs.colours(scan), unit=unit)]
         for text in traps(scan, figures["noise"] if figures["is_surface"] else None):
             self.console.note(f"{job.source}: {text}")
         self.console.note(f"{job.target}: {_summary(figures)}" + (f"; picture {picture}" if picture else ""))

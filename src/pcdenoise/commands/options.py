@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
+from typer.main import get_command
 
 from pcdenoise.errors import UsageError
 
@@ -49,9 +50,9 @@ def _defaults_from(path: Path, context: typer.Context) -> dict[str, Any]:
         settings = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise UsageError(f"{path}: not a readable TOML file ({_one_line(error)}); check the path and what it holds") from None
-    assert context.parent is not None
-    group = context.parent.command
-    commands: dict[str, Any] = getattr(group, "commands", {})
+    from pcdenoise.commands import app
+
+    commands: dict[str, Any] = vars(get_command(app()))["commands"]
     options = {name: {parameter.name for parameter in command.params} - {"config"} for name, command in commands.items()}
     everywhere = {_identifier(key): value for key, value in settings.items() if not isinstance(value, dict)}
     tables = {key: {_identifier(k): v for k, v in value.items()} for key, value in settings.items() if isinstance(value, dict)}
@@ -65,8 +66,9 @@ def _defaults_from(path: Path, context: typer.Context) -> dict[str, Any]:
         for key in values:
             if key not in options[table]:
                 raise UsageError(f"{path}: {table} has no option {_flag(key)}; see pcdenoise {table} --help")
-    known = options[str(context.info_name)]
-    merged = {**everywhere, **tables.get(str(context.info_name), {})}
+    called = str(context.command.name)
+    known = options[called]
+    merged = {**everywhere, **tables.get(called, {})}
     return {key: _as_typed_on_a_command_line(value) for key, value in merged.items() if key in known}
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from laspy.point import dims
 from numpy.typing import NDArray
 
 from pcdenoise.errors import ScanError
@@ -24,6 +23,38 @@ _ENTRY = np.dtype(
     ]
 )  # fmt: skip
 _UNDESCRIBED = "extra_bytes"
+
+_START = [("X", "<i4"), ("Y", "<i4"), ("Z", "<i4"), ("intensity", "<u2"), ("bit_fields", "u1")]
+_OLD = [*_START, ("raw_classification", "u1"), ("scan_angle_rank", "i1"), ("user_data", "u1"), ("point_source_id", "<u2")]
+_NEW = [
+    *_START, ("classification_flags", "u1"), ("classification", "u1"), ("user_data", "u1"), ("scan_angle", "<i2"),
+    ("point_source_id", "<u2"), ("gps_time", "<f8"),
+]  # fmt: skip
+_TIME, _NIR = [("gps_time", "<f8")], [("nir", "<u2")]
+_RGB = [("red", "<u2"), ("green", "<u2"), ("blue", "<u2")]
+_WAVE = [
+    ("wavepacket_index", "u1"), ("wavepacket_offset", "<u8"), ("wavepacket_size", "<u4"),
+    ("return_point_wave_location", "<f4"), ("x_t", "<f4"), ("y_t", "<f4"), ("z_t", "<f4"),
+]  # fmt: skip
+_FIELDS = [
+    _OLD, _OLD + _TIME, _OLD + _RGB, _OLD + _TIME + _RGB, _OLD + _TIME + _WAVE, _OLD + _TIME + _RGB + _WAVE,
+    _NEW, _NEW + _RGB, _NEW + _RGB + _NIR, _NEW + _WAVE, _NEW + _RGB + _NIR + _WAVE,
+]  # fmt: skip
+"""The fields of point formats 0 to 10 (ASPRS LAS 1.4, tables 7 to 17) under laspy's names for them."""
+
+_OLD_BITS = {
+    "bit_fields": {"return_number": 0x07, "number_of_returns": 0x38, "scan_direction_flag": 0x40, "edge_of_flight_line": 0x80},
+    "raw_classification": {"classification": 0x1F, "synthetic": 0x20, "key_point": 0x40, "withheld": 0x80},
+}
+_NEW_BITS = {
+    "bit_fields": {"return_number": 0x0F, "number_of_returns": 0xF0},
+    "classification_flags": {
+        "synthetic": 0x01, "key_point": 0x02, "withheld": 0x04, "overlap": 0x08, "scanner_channel": 0x30,
+        "scan_direction_flag": 0x40, "edge_of_flight_line": 0x80,
+    },
+}  # fmt: skip
+"""Fields that hold several dimensions, each with the mask of its bits; _OLD_BITS up to format 5."""
+
 _HAS_SCALE, _HAS_OFFSET = 8, 16
 
 
@@ -83,14 +114,13 @@ def structured(file: LasFile) -> tuple[NDArray[Any], dict[str, Dimension]]:
 
     Extra bytes no VLR describes are dimensions too (extra_bytes_0, …), so that nothing per point is without a name.
     """
-    standard = dims.ALL_POINT_FORMATS_DTYPE[file.point_format]
-    fields: list[Any] = [(name, standard[name]) for name in standard.names or ()]
+    fields: list[Any] = [(name, np.dtype(kind)) for name, kind in _FIELDS[file.point_format]]
+    bits = _OLD_BITS if file.point_format <= 5 else _NEW_BITS
     dimensions: dict[str, Dimension] = {}
-    for name, _ in fields:
-        bits = dims.COMPOSED_FIELDS[file.point_format].get(name)
-        for dimension in [Dimension(part.name, name, int(part.mask)) for part in bits] if bits else [Dimension(name, name)]:
-            dimensions[dimension.name] = dimension
-    left = file.records.shape[1] - standard.itemsize
+    for field, _ in fields:
+        for name, mask in bits.get(field, {field: 0}).items():
+            dimensions[name] = Dimension(name, field, mask)
+    left = file.records.shape[1] - standard_length(file.point_format)
     for entry in _entries(file):
         dtype, n_elements = _number_type(entry)
         if dtype.itemsize * n_elements > left:

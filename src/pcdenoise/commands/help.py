@@ -1,0 +1,31 @@
+"""Typer's help without what it imports and pcdenoise's help never shows. Not here: what the help says.
+
+`typer.rich_utils` imports Rich's Markdown and tracebacks, and with them Pygments and a Markdown parser, for settings that
+pcdenoise does not use: a third of the time that help takes (https://github.com/fastapi/typer/pull/1128 names it as left to do).
+"""
+
+from __future__ import annotations
+
+import sys
+from contextlib import suppress
+from types import ModuleType
+
+_UNUSED = {"rich.markdown": "Markdown", "rich.traceback": "Traceback"}
+
+
+def import_rich_help() -> None:
+    """Imports `typer.rich_utils` with empty classes in the place of those two, which others still import whole.
+
+    A Typer that wants more of them finds it missing here, and imports everything itself when it prints the help.
+    """
+    stood_in = [module for module in _UNUSED if module not in sys.modules]
+    for module in stood_in:
+        name = _UNUSED[module]
+        sys.modules[module] = ModuleType(module)
+        setattr(sys.modules[module], name, type(name, (), {}))
+    try:
+        with suppress(ImportError, AttributeError, TypeError):
+            import typer.rich_utils  # noqa: F401
+    finally:
+        for module in stood_in:
+            del sys.modules[module]
