@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 N_NEIGHBOURS = 16
 """Nearest points whose disc gives the density."""
 
-PASS_CPU_S_PER_POINT = 45e-6
+PASS_CPU_S_PER_POINT = 31e-6
 """CPU seconds that one pass of the shipped model takes for a point; to be set anew when the pass becomes faster."""
-START_CPU_S, START_BYTES, BYTES_PER_POINT = 5.0, 0.36e9, 950
-"""What a run costs beside that: a line through what `/usr/bin/time -v pcdenoise denoise` says of 42K and 519K points."""
+START_CPU_S, START_BYTES, BYTES_PER_POINT = 2.0, 0.1e9, 850
+"""What a run costs beside that: a line through what `benchmarks/speed/measure.py --sizes 50K 800K` says, where compiled code is."""
 
 _MOST_JUDGED = 200_000  # points of which outliers are counted
 _BLOCKS = 4  # compact parts of the cloud that they are taken from
