@@ -19,7 +19,7 @@ from pcdenoise.cloud.neighbours import coordinate_hash, knn
 from pcdenoise.cloud.noise_level import estimate
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import network_pass, pyramid, risk
-from pcdenoise.denoising.denoiser import Result, denoise, iterate
+from pcdenoise.denoising.denoiser import Result, denoise, iterate, level_of
 from pcdenoise.denoising.risk import Risk
 from pcdenoise.denoising.seeds import share_of_seeds
 from pcdenoise.errors import ModelError, UsageError
@@ -489,3 +489,9 @@ def test_the_network_needs_a_model_and_a_model_needs_numbers(fine: Cloud) -> Non
             broken.among[1].step.head.bias.fill_(float("nan"))
         with pytest.raises(ModelError, match=r"^[^\n]*positions that are not numbers; use another model[^\n]*$"):
             denoise(fine.noisy, Model.of(broken, "broken"), PLAIN)
+
+
+def test_the_noise_that_is_reported_is_the_noise_that_is_cleaned_by(coarse: Cloud) -> None:
+    repeated = np.concatenate([coarse.noisy, coarse.noisy[:10], np.full((1, 3), np.nan)])
+    reported, used = estimate(repeated[:-1]), level_of(repeated, PLAIN)
+    assert (used.std, used.spacing) == pytest.approx((reported.std, reported.spacing), rel=1e-9)

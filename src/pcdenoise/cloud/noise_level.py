@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdenoise.cloud.neighbours import Distances, Indices, NeighbourSearch, coordinate_hash, distinct, spatial_order
+from pcdenoise.cloud.neighbours import Distances, Indices, NeighbourSearch, coordinate_hash, distinct, drawn_by, spatial_order
 from pcdenoise.cloud.scan import Points
 
 N_PROBES = 1000
@@ -54,11 +54,11 @@ def estimate(points: Points, seed: int = 0, threads: int = -1) -> NoiseLevel:
     """
     points = points[distinct(points)[0]]
     points = points[spatial_order(points)]
-    return estimate_at(points, probes(coordinate_hash(points, seed)), threads)
+    return estimate_at(points, probes(drawn_by(coordinate_hash(points, 0), seed)), threads)
 
 
 def probes(hashes: NDArray[np.uint64]) -> Indices:
-    """Rows of at most N_PROBES points drawn by their hash, as of `coordinate_hash`: the same points in any order and any part."""
+    """Rows of at most N_PROBES points drawn by their hash, as of `drawn_by`: the same points in any order and any part."""
     if len(hashes) <= N_PROBES:
         return np.arange(len(hashes))
     return np.sort(np.argpartition(hashes, N_PROBES)[:N_PROBES])

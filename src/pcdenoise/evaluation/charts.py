@@ -152,14 +152,14 @@ def curve(
 
 
 def short(value: float) -> str:
-    """A number for people, three digits: 0.0123, 1.2e-05, 48 200, –."""
+    """A number for people, three digits: 0.0123, 1.2e-05, 48,200, –."""
     if not np.isfinite(value):
         return "\u2013"
     value += 0.0  # no negative zero
     whole = value == round(value) or abs(value) >= 1000
     digits = f"{value:.0f}" if whole and abs(value) < 1e15 else f"{value:.3g}"
     if whole and 10_000 <= abs(value) < 1e15:
-        digits = f"{value:,.0f}".replace(",", "\u00a0")
+        digits = f"{value:,.0f}"
     return digits.replace("-", "\u2212")
 
 

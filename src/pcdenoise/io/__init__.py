@@ -232,7 +232,9 @@ def _known(format: str) -> str:
 def _by_suffix(path: str | os.PathLike[str]) -> str:
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
-        raise ScanError(f"{os.fspath(path)}: suffix '{suffix}' is no scan format's ({' '.join(SUFFIXES)}); name the format")
+        raise ScanError(
+            f"{os.fspath(path)}: no suffix tells its format; name the format, or use one of {' '.join(sorted(SUFFIXES))}"
+        )
     return SUFFIXES[suffix]
 
 
