@@ -20,7 +20,7 @@ N_NEIGHBOURS = 16
 PASS_CPU_S_PER_POINT = 31e-6
 """CPU seconds that one pass of the shipped model takes for a point; to be set anew when the pass becomes faster."""
 START_CPU_S, START_BYTES, BYTES_PER_POINT = 2.0, 0.1e9, 850
-"""What a run costs beside that: a line through what `benchmarks/speed/measure.py --sizes 50K 800K` says, where compiled code is."""
+"""What a run costs beside that: a line through `benchmarks/speed/measure.py --sizes 50K 800K`, where compiled code is."""
 
 _MOST_JUDGED = 200_000  # points of which outliers are counted
 _BLOCKS = 4  # compact parts of the cloud that they are taken from
