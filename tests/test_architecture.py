@@ -11,9 +11,11 @@ from pathlib import Path
 
 import pytest
 
+from pcdenoise import commands
+
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted((ROOT / "src" / "pcdenoise").rglob("*.py"))
-COMMANDS = ["denoise", "info", "bench", "iterate", "verify", "undo", "models", "synth", "train", "eval-chamfer"]
+COMMANDS = list(commands._SUMMARIES)
 HEAVY = {"torch", "open3d", "scipy", "laspy", "plyfile", "safetensors", "numpy", "pydantic", "markdown_it"}
 
 _REPORT_MODULES = """

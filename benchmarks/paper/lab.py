@@ -126,7 +126,7 @@ class Lab:
             settings = {"method": subject.method, **self.tuned(subject, seed)}
         config = DenoiseConfig(iters=self.scale.passes, seed=seed, threads=self.threads, **settings)
         steps = denoiser.iterate(points, model, config)
-        return ((step.points, step.figures["error_before"], step.figures["error_after"]) for step in steps)
+        return ((step.points, step.figures["estimated_error_before"], step.figures["estimated_error_after"]) for step in steps)
 
     def _patch_steps(self, subject: Subject, seed: int, points: Points) -> Iterator[tuple[Points, float, float]]:
         """As `denoiser.iterate` goes, for a network that pcdenoise does not know."""

@@ -7,8 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 BLOCK_POINTS = 1024
-"""With 24 neighbours and 32 channels of float32 a block's messages take 3 MB; twice as many leave the cache, and half as many
-cost more in calls than the cache saves."""
+"""What is known of so many points and their neighbours fits the cache; half as many cost more in calls than the cache saves."""
 
 
 def each_block(work: Callable[[slice], None], n: int, threads: int, block_points: int = BLOCK_POINTS) -> None:

@@ -11,6 +11,7 @@ import signal
 import sys
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from glob import glob
 from importlib import import_module
 from io import TextIOWrapper
 from types import FrameType
@@ -109,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _replace_closed_streams()
     with _polite_kills():
         try:
-            code = _run(sys.argv[1:] if arguments is None else arguments)
+            code = _run(_typed() if arguments is None else arguments)
             sys.stdout.flush()
             return _fail("interrupted; nothing is half-written", INTERRUPTED) if code == INTERRUPTED else int(code or 0)
         except PcdenoiseError as error:
@@ -122,6 +123,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if isinstance(stop.__context__, BrokenPipeError):  # Typer makes it exit code 1
                 return _without_reader()
             raise
+        except KeyboardInterrupt:  # while a command's module is imported; Typer knows of it later
+            return _fail("interrupted; nothing is half-written", INTERRUPTED)
         except Exception as fault:
             if isinstance(fault.__cause__, KeyboardInterrupt):  # Python 3.11 wraps what comes while a class is being made
                 return _fail("interrupted; nothing is half-written", INTERRUPTED)
@@ -133,6 +136,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if isinstance(fault, OSError) and fault.filename is None:
                 _drop_stdout()
             return _fail(str(known), known.exit_code)
+
+
+def _typed() -> list[str]:
+    """What stands on the command line, with patterns expanded where the shell does not: on Windows."""
+    given = sys.argv[1:]
+    return [found for text in given for found in (sorted(glob(text)) or [text])] if os.name == "nt" else given
 
 
 @contextmanager

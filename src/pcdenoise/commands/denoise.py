@@ -226,7 +226,7 @@ class _Cleaning:
 
     @cached_property
     def model(self) -> Model | None:
-        """Loaded when it is first asked for, once a scan is read: torch takes seconds to import."""
+        """Loaded when it is first asked for, once a scan is read: faults of scans come first."""
         return chosen_model(self.model_name, self.config)
 
     @property

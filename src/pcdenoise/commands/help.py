@@ -10,6 +10,8 @@ import sys
 from contextlib import suppress
 from types import ModuleType
 
+from typer import core
+
 _UNUSED = {"rich.markdown": "Markdown", "rich.traceback": "Traceback"}
 
 
@@ -18,6 +20,8 @@ def import_rich_help() -> None:
 
     A Typer that wants more of them finds it missing here, and imports everything itself when it prints the help.
     """
+    if not getattr(core, "HAS_RICH", True):
+        return
     stood_in = [module for module in _UNUSED if module not in sys.modules]
     for module in stood_in:
         name = _UNUSED[module]

@@ -128,7 +128,7 @@ def _save_report(path: Path, scan: Scan, passes: list[_Pass], settings: dict[str
 
     last = passes[-1]
     numbers = range(len(passes))
-    names = [name for name, value in last.figures.items() if isinstance(value, float) and name != "roughness_before"]
+    names = [name for name, value in last.figures.items() if isinstance(value, float) and not name.endswith("_before")]
     charts = [
         curve(
             {"": [entry.figures.get(name, float("nan")) for entry in passes]},

@@ -17,10 +17,11 @@ if TYPE_CHECKING:
 N_NEIGHBOURS = 16
 """Nearest points whose disc gives the density."""
 
-PASS_CPU_S_PER_POINT = 31e-6
-"""CPU seconds that one pass of the shipped model takes for a point; to be set anew when the pass becomes faster."""
-START_CPU_S, START_BYTES, BYTES_PER_POINT = 2.0, 0.1e9, 850
-"""What a run costs beside that: a line through `benchmarks/speed/measure.py --sizes 50K 800K`, where compiled code is."""
+_COST = (31e-6, 2.0, 850, 0.1e9)
+"""CPU seconds that one pass of the shipped model takes for a point and a run beside that, bytes of memory likewise: a line
+through `benchmarks/speed/measure.py --sizes 50K 800K`. To be set anew when the pass becomes faster."""
+_COST_IN_TORCH = (90e-6, 5.0, 950, 0.36e9)
+"""The same where nothing was compiled."""
 
 _MOST_JUDGED = 200_000  # points of which outliers are counted
 _BLOCKS = 4  # compact parts of the cloud that they are taken from
@@ -95,9 +96,12 @@ def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
 
 def cost(n_points: int, n_passes: int = 1) -> dict[str, float]:
     """Processor seconds and bytes of memory that cleaning so many points takes, roughly: machines differ."""
+    from pcdenoise.networks import fused
+
+    cpu_s_per_point, start_cpu_s, bytes_per_point, start_bytes = _COST if fused.IS_BUILT else _COST_IN_TORCH
     return {
-        "expected_cpu_s": START_CPU_S + PASS_CPU_S_PER_POINT * n_points * n_passes,
-        "expected_memory_mb": (START_BYTES + BYTES_PER_POINT * n_points) / 1e6,
+        "expected_cpu_s": start_cpu_s + cpu_s_per_point * n_points * n_passes,
+        "expected_memory_mb": (start_bytes + bytes_per_point * n_points) / 1e6,
     }
 
 

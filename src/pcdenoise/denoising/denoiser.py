@@ -49,7 +49,7 @@ Progress = Callable[[str, float], None]
 class Step:
     """The cloud after one pass, and its figures: iteration, move_median, move_max, roughness_before, roughness_after.
 
-    error_before and error_after, where they were looked at, are those of `risk.Risk`. Roughness is the estimated noise: what
+    estimated_error_before and _after, where they were looked at, are those of `risk.Risk`. Roughness is the estimated noise: what
     neighbours disagree by. After a pass it says how smooth the cloud is, not how far it still is from the truth.
     """
 
@@ -221,7 +221,7 @@ class Judge:
         before, after = self._risk.after(next_pass)
         if self._config.iters == "auto" and not is_worthwhile(before, after, self._spacing):
             return None
-        return {"error_before": before, "error_after": after}
+        return {"estimated_error_before": before, "estimated_error_after": after}
 
 
 def _passes(

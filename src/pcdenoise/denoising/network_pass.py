@@ -112,7 +112,7 @@ def mcconv(points: Points, unit: float, model: Model, seed: int, threads: int, o
         for start in range(0, len(points), _DECODED_AT_ONCE):
             moves.append(network.decode(code, local[start : start + _DECODED_AT_ONCE], rng).double().numpy())
             on_share(min((start + _DECODED_AT_ONCE) / len(points), 1.0))
-    return fused.numbers(points + unit * np.concatenate(moves))
+    return fused.checked_finite(points + unit * np.concatenate(moves))
 
 
 @contextmanager

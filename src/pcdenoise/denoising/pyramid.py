@@ -17,7 +17,7 @@ from torch import Tensor
 from pcdenoise.cloud.blocks import BLOCK_POINTS, blocks, each_block
 from pcdenoise.cloud.neighbours import NeighbourSearch
 from pcdenoise.cloud.scan import Points
-from pcdenoise.networks.fused import numbers
+from pcdenoise.networks.fused import checked_finite
 from pcdenoise.networks.projection import (
     Edges,
     Planes,
@@ -93,7 +93,7 @@ def descend(
 
 
 def _numbers(points: Tensor) -> Tensor:
-    numbers(points.detach().numpy())
+    checked_finite(points.detach().numpy())
     return points
 
 

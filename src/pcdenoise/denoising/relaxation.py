@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pcdenoise.cloud.blocks import each_block
 from pcdenoise.cloud.neighbours import NeighbourSearch, pairs_within, thinned
 from pcdenoise.cloud.scan import Points, within
+from pcdenoise.networks.fused import address
 
 try:
     from pcdenoise.denoising import _relaxation
@@ -48,7 +49,7 @@ def relax(points: Points, noise_std: float, steps: int, threads: int = -1) -> Po
         return points
     k = min(_NEIGHBOURS, len(points) - 1)
     distances, found = NeighbourSearch(points, threads).knn(points, k + 1)
-    start = np.ascontiguousarray(points)
+    start = np.ascontiguousarray(points, np.float64)
     sheet = (_Compiled if IS_BUILT else _Sheet)(start, found.astype(np.int32), distances[:, k] / np.sqrt(k / 2.5), threads)
     del distances, found
     current = start
@@ -155,10 +156,8 @@ class _Compiled(_Sheet):
 
     @property
     def _graph(self) -> _relaxation.Graph:
-        return _at(self.index), self.index.shape[1]
+        return address(self.index, np.int32), self.index.shape[1]
 
 
-def _at(values: NDArray[np.generic]) -> int:
-    """The address of dense values."""
-    assert values.flags.c_contiguous
-    return values.ctypes.data
+def _at(values: NDArray[np.float64]) -> int:
+    return address(values, np.float64)

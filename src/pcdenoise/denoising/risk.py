@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pcdenoise.cloud.blocks import each_block
 from pcdenoise.cloud.neighbours import NeighbourSearch, drawn_by
 from pcdenoise.cloud.noise_level import NoiseLevel
 from pcdenoise.cloud.scan import Points
@@ -55,10 +56,16 @@ class Risk:
         self.points, self.identity = points, identity
         self._start, self._threads = points, threads
         k = int(np.clip(level.scale_points, *_NEIGHBOURS))
-        near = points[NeighbourSearch(points, threads).knn(points, k)[1]]
-        middle = near.mean(axis=1)
-        near -= middle[:, None]
-        self._normals = np.linalg.eigh(near.transpose(0, 2, 1) @ near)[1][:, :, 0]
+        index, middle = NeighbourSearch(points, threads).nearest(points, k), np.empty_like(points)
+        self._normals = np.empty_like(points)
+
+        def look(rows: slice) -> None:
+            near = points[index[rows]]
+            middle[rows] = near.mean(axis=1)
+            near -= middle[rows, None]
+            self._normals[rows] = np.linalg.eigh(near.transpose(0, 2, 1) @ near)[1][:, :, 0]
+
+        each_block(look, len(points), threads)
         height = self._along(points - middle)
         self._counted = np.abs(height) <= max(_FURTHEST_STDS * level.std, np.median(np.abs(height)))
         sign, *beside = (_shares(identity, seed, number) for number in _DRAWS)

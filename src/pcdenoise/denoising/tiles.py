@@ -43,7 +43,8 @@ from pcdenoise.networks.store import Model
 from pcdenoise.whole_files import replaced
 
 BASE_BYTES, POINT_BYTES = 400 << 20, 1100
-"""Memory of the program itself, and of each point of the part that is being cleaned (measured, with a tenth to spare)."""
+"""Memory of the program itself, and of each point of the part that is being cleaned: measured where torch
+runs the network, with a tenth to spare; compiled code takes three quarters of it."""
 _CORE_SHARE = 0.55  # of a tile's points are the cell's own, the others its rim
 _RIM_RADII = 5.0
 """Width of the rim in radii of the network's neighbourhoods. A pass reaches eight radii at most, but a neighbour's weight is zero
@@ -198,13 +199,15 @@ class Tiles:
         judge = self._judge(first) if most and self.config.iters == "auto" else None
         for number in range(1, most + 1):
             task = "cleaning" if self.config.iters == 1 else f"pass {number}"
-            if judge is not None and judge.figures(level) is None:
+            judgement = judge.figures(level) if judge is not None else {}
+            if judgement is None:
                 break
             for cell in self.cells:
                 self.clean(cell, number, level)
                 on_progress(task, (cell + 1) / len(self.cells))
             after = self.level(number)
-            self.steps.append({"iteration": number, "roughness_before": level.std, "roughness_after": after.std})
+            roughness = {"roughness_before": level.std, "roughness_after": after.std}
+            self.steps.append({"iteration": number, **roughness, **judgement})
             if number > 2:
                 shutil.rmtree(self.folder / f"pass_{number - 2}", ignore_errors=True)
             level, n_done = after, number

@@ -48,7 +48,7 @@ _WORDS = {
     "cd": "Chamfer distance (1e-4, unit sphere)", "p2s": "to the surface (1e-4, unit sphere)",
     "p2m": "to and from the surface (1e-4, unit sphere)", "td": "Total Denoising's error (% of the diagonal)",
     "shrinkage": "shrinkage (% of the diagonal)", "normal_error": "error of normals (\u00b0)",
-    "error_before": "error before", "error_after": "error after", "cpu_s": "CPU (s)",
+    "estimated_error_before": "error before, estimated", "estimated_error_after": "error after, estimated", "cpu_s": "CPU (s)",
 }  # fmt: skip
 """How a page says what JSON calls so."""
 _UNITS = {"m": "m", "mm": "mm", "s": "s", "percent": "%", "mb": "MB", "deg": "\u00b0"}

@@ -1,13 +1,14 @@
 """The projection network's inference in compiled code: without torch, and several times as fast as layer by layer.
 
 It is there where a C compiler was when the program was installed; elsewhere torch does the same (denoising.pyramid). Both agree
-to float32's rounding. Not here: the arithmetic (fused.c), which points are seeds (denoising.seeds).
+to float32's rounding wherever neighbours span a plane. Not here: the arithmetic (fused.c), the choice of seeds (denoising.seeds).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +65,7 @@ def _stage(weights: Weights, name: str, n_rounds: int) -> _Stage:
 
 
 @dataclass(frozen=True)
-class _Looking:
+class _Surroundings:
     """M points that look at K sources each: points (M, 3), sources (N, 3), index (M, K), count (N,) or None."""
 
     points: Points
@@ -72,7 +73,7 @@ class _Looking:
     index: NDArray[np.int32]
     count: Values | None
     noise: float
-    each_block: Callable[[Callable[[slice], None], int], None]
+    over: Callable[[Callable[[slice], None], int], None]
     on_block: Callable[[int], None]
 
     def around(self, stage: _Stage | None) -> tuple[Values, Values, Values]:
@@ -84,7 +85,7 @@ class _Looking:
         def look(rows: slice) -> None:
             _fused.look(self._given, rows.start, rows.stop, _at(embedding), _at(normals), _at(shapes), _at(features))
 
-        self.each_block(look, n)
+        self.over(look, n)
         return normals, shapes, features
 
     def hear(self, hearing: Values, features: Values) -> Values:
@@ -92,10 +93,10 @@ class _Looking:
         heard = _empty(len(hearing), *features.shape)
         for weight, said in zip(hearing, heard, strict=True):
 
-            def hear(rows: slice) -> None:
+            def hear_some(rows: slice) -> None:
                 _fused.hear(_at(features), rows.start, rows.stop, _at(weight), _at(said))  # noqa: B023
 
-            self.each_block(hear, len(features))
+            self.over(hear_some, len(features))
         return heard
 
     def told(
@@ -114,13 +115,13 @@ class _Looking:
             )  # fmt: skip
             self.on_block((rows.stop - rows.start) * len(rounds))
 
-        self.each_block(talk, len(before))
+        self.over(talk, len(before))
         return features, moves
 
     @property
     def _given(self) -> _fused.Surroundings:
-        points, sources, index, count = map(_at, (self.points, self.sources, self.index, self.count))
-        return points, sources, index, count, self.index.shape[1], self.noise
+        places = address(self.points, np.float64), address(self.sources, np.float64)
+        return *places, address(self.index, np.int32), _at(self.count), self.index.shape[1], self.noise
 
 
 def descend(
@@ -150,10 +151,10 @@ def descend(
     def nearest(points: Points, sources: Points) -> NDArray[np.int32]:
         return NeighbourSearch(sources, threads).nearest(points, sizes.neighbours)
 
-    def looking(points: Points, sources: Points, index: NDArray[np.int32]) -> _Looking:
-        return _Looking(points, sources, index, behind, noise, over, on_block)
+    def looking(points: Points, sources: Points, index: NDArray[np.int32]) -> _Surroundings:
+        return _Surroundings(points, sources, index, behind, noise, over, on_block)
 
-    points = np.ascontiguousarray(seeds)
+    points = np.ascontiguousarray(seeds, np.float64)
     stages = [_stage(weights, f"stages.{number}", n_rounds) for number, n_rounds in enumerate(sizes.rounds)]
     index = nearest(points, points)
     normals, shape, features = looking(points, points, index).around(stages[0])
@@ -166,20 +167,20 @@ def descend(
             rounds, heard = stage.rounds[turn : turn + 1], among.hear(stage.hearing[turn : turn + 1], features)
             head = stage.head if turn + 1 == len(stage.rounds) else None
             features, moves = among.told(rounds, head, (normals, normals), heard, features)
-        points = numbers(points + moves)
+        points = checked_finite(points + moves)
         if raw is not None:  # points that are their own seeds hardly move: they keep their neighbours
             index = nearest(points, points)
     if raw is None:
         return points, shape
     theirs, _, _ = looking(points, points, index).around(None)
-    landing, stage = np.ascontiguousarray(raw), _stage(weights, "landing", sizes.landing_rounds)
+    landing, stage = np.ascontiguousarray(raw, np.float64), _stage(weights, "landing", sizes.landing_rounds)
     on_seeds = looking(landing, points, nearest(landing, points))
     mine, _, known = on_seeds.around(stage)
     _, moves = on_seeds.told(stage.rounds, stage.head, (mine, theirs), on_seeds.hear(stage.hearing, features), known)
-    return numbers(landing + moves), shape
+    return checked_finite(landing + moves), shape
 
 
-def numbers(points: Points) -> Points:
+def checked_finite(points: Points) -> Points:
     """The points. Raises ModelError where one is no number, which only broken weights bring about."""
     if not np.isfinite(points).all():
         raise ModelError("the network gave positions that are not numbers; use another model, or --method jet")
@@ -190,9 +191,17 @@ def _empty(*shape: int) -> Values:
     return np.empty(shape, np.float32)
 
 
-def _at(values: NDArray[np.generic] | None) -> int:
-    """The address of dense values, 0 for none."""
+def address(values: NDArray[Any] | None, kind: type[np.generic]) -> int:
+    """Where the numbers of an array lie, for compiled code, which takes them as they are; 0 for none.
+
+    Raises TypeError for numbers of another kind and for those that do not lie row by row.
+    """
     if values is None:
         return 0
-    assert values.flags.c_contiguous
+    if values.dtype != kind or not values.flags.c_contiguous:
+        raise TypeError(f"compiled code takes dense arrays of {kind.__name__}, not {values.dtype} with strides {values.strides}")
     return values.ctypes.data
+
+
+def _at(values: Values | None) -> int:
+    return address(values, np.float32)

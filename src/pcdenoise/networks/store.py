@@ -13,7 +13,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
@@ -86,7 +86,7 @@ class Model:
     name: str
     config: ModelConfig
     sha256: str
-    weights: Weights
+    weights: Weights = field(compare=False, repr=False)
 
     @classmethod
     def of(cls, network: Network, name: str) -> Model:
@@ -234,7 +234,7 @@ def _build(config: ModelConfig) -> Network:
 
 
 def _weights(network: Network) -> dict[str, NDArray[Any]]:
-    return {name: tensor.detach().contiguous().numpy().copy() for name, tensor in network.state_dict().items()}
+    return {name: tensor.detach().cpu().contiguous().numpy().copy() for name, tensor in network.state_dict().items()}
 
 
 _KINDS = {"F32": np.float32, "I64": np.int64}
