@@ -154,7 +154,7 @@ class Lab:
         folder = self.folder / "models" / f"{subject.name}-{seed}"
         if not folder.exists():
             self._say(f"training {subject.name}, seed {seed}")
-            part = folder.with_suffix(".part")
+            part = folder.with_name(f"{folder.name}.part")
             shutil.rmtree(part, ignore_errors=True)
             if subject.method == "pointnet":
                 self._learn_patches(subject, seed, part)
@@ -168,7 +168,7 @@ class Lab:
         path = self.folder / "errors" / f"along-{subject.name}-{seed}.json"
         if not path.exists():
             self._say(f"training {subject.name}, seed {seed}, with pauses")
-            part, errors = path.with_suffix(".part"), []
+            part, errors = path.with_name(f"{path.name}.part"), []
             shutil.rmtree(part, ignore_errors=True)
             for number, mark in enumerate(marks):
                 pause = _Pause(mark / self.scale.steps)
