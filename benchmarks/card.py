@@ -2,6 +2,7 @@
 
     python score.py --run "pcdenoise denoise {input} -o {output} --overwrite" --json scores.json
     python benchmarks/card.py scores.json src/pcdenoise/models/default
+    python benchmarks/card.py scores.json src/pcdenoise/models/total --iters 3      # what the benchmark was run with
 
 score.py belongs to the benchmark (five shapes that no model is trained or tuned on, at 10K and 50K points), not to this project.
 Peers are compared on the shapes that they were run on. Not here: measuring.
@@ -19,7 +20,7 @@ PEERS = ("ScoreDenoise", "CGAL jet", "CGAL bilateral", "MeshLab APSS", "Straight
 
 EXPLANATION = """\
 `cd / p2s` × 1e-4, lower is better: squared Chamfer distance to a clean Poisson sample, and squared distance to the surface, in
-the unit sphere. Mean of {n_shapes} shapes that nothing was trained or tuned on; one pass, default settings. Peers ran on the same
+the unit sphere. Mean of {n_shapes} shapes that nothing was trained or tuned on; {passes}. Peers ran on the same
 files on the same kind of machine; the classical ones had their parameters tuned *with* the truth. Where a peer ran on fewer
 shapes, their number and our score on them stand in brackets. CPU s: the whole process per cloud, start-up included.
 
@@ -58,8 +59,9 @@ def main() -> None:
     rows, folder = json.loads(Path(sys.argv[1]).read_text()), Path(sys.argv[2])
     card, config_path = folder / "README.md", folder / "config.json"
     text = card.read_text().split(HEADING)[0].rstrip()
-    option = "" if folder.name == "default" else f" --model {folder.name}"
-    explanation = EXPLANATION.format(n_shapes=len(rows[0]["shapes"]), option=option)
+    option = " ".join(["" if folder.name == "default" else f" --model {folder.name}", *sys.argv[3:]])
+    passes = "settings as the command says" if sys.argv[3:] else "one pass, default settings"
+    explanation = EXPLANATION.format(n_shapes=len(rows[0]["shapes"]), option=option, passes=passes)
     card.write_text(f"{text}\n\n{HEADING}\n\n{explanation}\n{table(rows)}\n")
     config = json.loads(config_path.read_text())
     config["scores"] = {f"{row['n']}_{row['level']}": {key: round(row[key], 3) for key in ("cd", "p2s", "td")} for row in rows}
