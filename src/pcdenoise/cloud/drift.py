@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pcdenoise.cloud.neighbours import NeighbourSearch, distinct, spatial_order
+from pcdenoise.cloud.neighbours import NeighbourSearch, distinct, principal_axes, spatial_order
 from pcdenoise.cloud.scan import Points
 
 N_PROBES = 2000
@@ -49,7 +49,7 @@ def measure(before: Points, after: Points, seed: int = 0, threads: int = -1) -> 
     k = min(K_NEIGHBOURS, len(points))
     indices = NeighbourSearch(points, threads).knn(probes, k)[1]
     near = points[indices] - points[indices].mean(axis=1, keepdims=True)
-    frames = np.linalg.eigh(near.transpose(0, 2, 1) @ near)[1]  # (M, 3, 3); the first axis is the normal
+    frames = principal_axes(near)  # (M, 3, 3); the first axis is the normal
     height = np.einsum("mki,mi->mk", near, frames[:, :, 0])
     span = (near**2).sum(axis=2) - height**2
     span -= span.mean(axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Who is near whom: spatial order, nearest neighbours, pairs within a radius. Not here: what is done with them."""
+"""Who is near whom: spatial order, nearest neighbours, how they lie, pairs within a radius. Not here: what is done with them."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from pcdenoise.cloud.scan import Points
 
 Indices = NDArray[np.int64]
 Distances = NDArray[np.float64]
+Identity = NDArray[np.uint64]
+"""(N,) the `coordinate_hash` of where points were in the file: a part of a cloud draws by it as the whole does, in any pass."""
 
 PAIRS_AT_ONCE = 2**20
 """About how many pairs are in memory at a time."""
@@ -82,6 +84,12 @@ def knn(points: Points, k: int, queries: Points | None = None, threads: int = -1
     back = np.empty_like(query_order)
     back[query_order] = np.arange(len(query_order))
     return distances[back], order[indices[back]]
+
+
+def principal_axes(centred: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(M, 3, 3) axes of (M, K, 3) neighbours about their means, as columns, the thinnest first: the normal."""
+    axes: NDArray[np.float64] = np.linalg.eigh(centred.transpose(0, 2, 1) @ centred)[1]
+    return axes
 
 
 def radius_pairs(points: Points, radius: float) -> Indices:

@@ -8,7 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdenoise.cloud.neighbours import Distances, Indices, NeighbourSearch, coordinate_hash, distinct, drawn_by, spatial_order
+from pcdenoise.cloud.neighbours import (
+    Distances,
+    Indices,
+    NeighbourSearch,
+    coordinate_hash,
+    distinct,
+    drawn_by,
+    principal_axes,
+    spatial_order,
+)
 from pcdenoise.cloud.scan import Points
 
 N_PROBES = 1000
@@ -165,7 +174,7 @@ def _quadric_residual(near: Points, centres: Points, radius: NDArray[np.float64]
     """(M,) standard deviation that a quadric over the PCA plane leaves in (M, k, 3) neighbourhoods, as a share of the radius."""
     near = (near - centres[:, None]) / radius[:, None, None]
     near -= near.mean(axis=1, keepdims=True)
-    frames = np.linalg.eigh(near.transpose(0, 2, 1) @ near)[1]
+    frames = principal_axes(near)
     height, u, v = np.moveaxis(near @ frames, 2, 0)
     design = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
     transposed = design.transpose(0, 2, 1)

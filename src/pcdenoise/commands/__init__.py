@@ -112,7 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             code = _run(_typed() if arguments is None else arguments)
             sys.stdout.flush()
-            return _fail("interrupted; nothing is half-written", INTERRUPTED) if code == INTERRUPTED else int(code or 0)
+            return _interrupted() if code == INTERRUPTED else int(code or 0)
         except PcdenoiseError as error:
             return _fail(str(error), error.exit_code)
         except typer.TyperException as error:
@@ -124,10 +124,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 return _without_reader()
             raise
         except KeyboardInterrupt:  # while a command's module is imported; Typer knows of it later
-            return _fail("interrupted; nothing is half-written", INTERRUPTED)
+            return _interrupted()
         except Exception as fault:
             if isinstance(fault.__cause__, KeyboardInterrupt):  # Python 3.11 wraps what comes while a class is being made
-                return _fail("interrupted; nothing is half-written", INTERRUPTED)
+                return _interrupted()
             if isinstance(fault.__cause__, SystemExit):
                 raise fault.__cause__ from None
             known = of_the_system(fault)
@@ -181,6 +181,10 @@ def _drop_stdout() -> None:
     """What stdout still holds goes nowhere, so that Python's own last flush does not complain."""
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _interrupted() -> int:
+    return _fail("interrupted; nothing is half-written", INTERRUPTED)
 
 
 def _fail(message: str, code: int) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdenoise.cloud import drift
-from pcdenoise.cloud.neighbours import coordinate_hash, distinct_by, drawn_by, spatial_order
+from pcdenoise.cloud.neighbours import Identity, coordinate_hash, distinct_by, drawn_by, spatial_order
 from pcdenoise.cloud.noise_level import NoiseLevel, estimate_at, probes
 from pcdenoise.cloud.scan import Mask, Points, check_extent, within
 from pcdenoise.config import DenoiseConfig
@@ -39,8 +39,6 @@ _WORTHWHILE = 2e-3
 _NOTHING = 1e-6
 """Of the spacing: an error that falls by less is that of a cloud without noise."""
 
-Identity = NDArray[np.uint64]
-"""(N,) the `coordinate_hash` of where points were in the file: a part of a cloud draws by it as the whole does, in any pass."""
 Progress = Callable[[str, float], None]
 """Called with what is being done and the share of it that is done, 0 to 1."""
 

@@ -13,6 +13,7 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
+from pcdenoise.cloud.neighbours import Identity
 from pcdenoise.cloud.noise_level import NoiseLevel
 from pcdenoise.cloud.scan import Points
 from pcdenoise.denoising.seeds import coarsen, share_of_seeds
@@ -24,7 +25,7 @@ _DECODED_AT_ONCE = 65_536
 
 def projection(
     points: Points,
-    identity: NDArray[np.uint64],
+    identity: Identity,
     level: NoiseLevel,
     model: Model,
     seed: int,

@@ -68,7 +68,7 @@ def descend(
         return torch.from_numpy(search.nearest(points.detach().numpy(), network.config.neighbours))
 
     def looking(points: Tensor, sources: Tensor, index: Tensor) -> _Looking:
-        return _Looking(_Surroundings(points, sources, index, weights, noise), block_points, threads)
+        return _Looking(points, sources, index, weights, noise, block_points, threads)
 
     index = nearest(points, points)
     features: Tensor | None = None
@@ -97,39 +97,34 @@ def _numbers(points: Tensor) -> Tensor:
     return points
 
 
-@dataclass(frozen=True)
-class _Surroundings:
-    """M points that look at K sources each: points (M, 3), sources (N, 3) float64, index (M, K) int32, count (N,) or None."""
-
-    points: Tensor
-    sources: Tensor
-    index: Tensor
-    count: Tensor | None
-    noise: float
-
-
 class _Looking:
-    """M points that look at their nearest sources, block by block; with a single block nothing is computed twice."""
+    """M points that look at their nearest sources, block by block; with a single block nothing is computed twice.
 
-    def __init__(self, here: _Surroundings, block_points: int, threads: int) -> None:
-        self.here, self.block_points, self.threads = here, block_points, threads
+    points (M, 3), sources (N, 3) float64; index (M, K) int32: rows of each point's sources; count (N,) or None.
+    """
+
+    def __init__(
+        self, points: Tensor, sources: Tensor, index: Tensor, count: Tensor | None, noise: float, block_points: int, threads: int
+    ) -> None:
+        self.points, self.sources, self.index, self.count = points, sources, index, count
+        self.noise, self.block_points, self.threads = noise, block_points, threads
         self._only: Edges | None = None
         self._only_features: tuple[Tensor, Tensor, Tensor] | None = None
 
     def over_blocks(self, work: Callable[[slice, Edges], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
         """What `work` gives for each block and its edges, put together."""
-        return _in_blocks(lambda block: work(block, self._edges(block)), len(self.here.points), self.threads, self.block_points)
+        return _in_blocks(lambda block: work(block, self._edges(block)), len(self.points), self.threads, self.block_points)
 
     @property
     def in_one(self) -> bool:
         """Whether all points are one block, whose edges are kept."""
-        return len(self.here.points) <= self.block_points
+        return len(self.points) <= self.block_points
 
     def _edges(self, block: slice) -> Edges:
         if self._only is not None:
             return self._only
-        index = self.here.index[block]
-        graph = edges((at(self.here.sources, index) - self.here.points[block, None]).float(), index, self.here.count)
+        index = self.index[block]
+        graph = edges((at(self.sources, index) - self.points[block, None]).float(), index, self.count)
         if self.in_one:
             self._only = graph
         return graph
@@ -143,7 +138,7 @@ class _Looking:
 
         def look(_: slice, graph: Edges) -> tuple[Tensor, ...]:
             plane = planes(graph)
-            return *plane, stage.embed(point_features(graph, plane, self.here.noise))
+            return *plane, stage.embed(point_features(graph, plane, self.noise))
 
         normal, shape, known = self.over_blocks(look)
         return Planes(normal, shape), known
@@ -173,8 +168,8 @@ class _Looking:
 
         def land(block: slice, graph: Edges) -> tuple[Tensor]:
             mine = planes(graph)
-            features = stage.embed(point_features(graph, mine, self.here.noise))
-            edge, a, b = edge_features(graph, mine, theirs, self.here.noise)
+            features = stage.embed(point_features(graph, mine, self.noise))
+            edge, a, b = edge_features(graph, mine, theirs, self.noise)
             for layer, said in zip(stage.exchanges, heard, strict=True):
                 message, features = layer(edge, graph, features, said)
                 on_block(block.stop - block.start)
@@ -184,9 +179,9 @@ class _Looking:
 
     def _features(self, graph: Edges, mine: Planes, theirs: Planes) -> tuple[Tensor, Tensor, Tensor]:
         if not self.in_one:
-            return edge_features(graph, mine, theirs, self.here.noise)
+            return edge_features(graph, mine, theirs, self.noise)
         if self._only_features is None:
-            self._only_features = edge_features(graph, mine, theirs, self.here.noise)
+            self._only_features = edge_features(graph, mine, theirs, self.noise)
         return self._only_features
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdenoise.cloud.blocks import each_block
-from pcdenoise.cloud.neighbours import NeighbourSearch, drawn_by
+from pcdenoise.cloud.neighbours import Identity, NeighbourSearch, drawn_by, principal_axes
 from pcdenoise.cloud.noise_level import NoiseLevel
 from pcdenoise.cloud.scan import Points
 
@@ -48,7 +48,7 @@ class Risk:
     identity (N,): the `coordinate_hash` of where the points were in the file.
     """
 
-    def __init__(self, points: Points, identity: NDArray[np.uint64], level: NoiseLevel, seed: int, threads: int) -> None:
+    def __init__(self, points: Points, identity: Identity, level: NoiseLevel, seed: int, threads: int) -> None:
         if len(points) > MOST_POINTS:
             distance = np.linalg.norm(points - points[drawn_by(identity, seed).argmin()], axis=1)
             nearest = np.sort(np.argpartition(distance, MOST_POINTS)[:MOST_POINTS])
@@ -63,7 +63,7 @@ class Risk:
             near = points[index[rows]]
             middle[rows] = near.mean(axis=1)
             near -= middle[rows, None]
-            self._normals[rows] = np.linalg.eigh(near.transpose(0, 2, 1) @ near)[1][:, :, 0]
+            self._normals[rows] = principal_axes(near)[:, :, 0]
 
         each_block(look, len(points), threads)
         height = self._along(points - middle)
@@ -120,7 +120,7 @@ class _Passed:
         return float(distance + np.sqrt(self.gap**2 + distance**2).mean())
 
 
-def _shares(identity: NDArray[np.uint64], seed: int, number: int) -> NDArray[np.float64]:
+def _shares(identity: Identity, seed: int, number: int) -> NDArray[np.float64]:
     """(N,) from -1/2 to 1/2, evenly spread and the same for the same point in any order."""
     shares: NDArray[np.float64] = drawn_by(drawn_by(identity, seed), number) / 2.0**64 - 0.5
     return shares

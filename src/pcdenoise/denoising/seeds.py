@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdenoise.cloud.neighbours import Indices, NeighbourSearch, coordinate_hash, drawn_by
+from pcdenoise.cloud.neighbours import Identity, Indices, NeighbourSearch, coordinate_hash, drawn_by
 from pcdenoise.cloud.noise_level import NoiseLevel
 from pcdenoise.cloud.scan import Points
 
@@ -37,7 +37,7 @@ def share_of_seeds(level: NoiseLevel, neighbours: int) -> float:
     return min(share, densest) if share < 1.5 * densest else 1.0
 
 
-def coarsen(points: Points, share: float, seed: int = 0, threads: int = -1, identity: NDArray[np.uint64] | None = None) -> Seeds:
+def coarsen(points: Points, share: float, seed: int = 0, threads: int = -1, identity: Identity | None = None) -> Seeds:
     """About share * N seeds of (N, 3) finite points in spatial order, spread evenly relative to the local density.
 
     identity (N,): what to draw by in place of the coordinates, for points whose last bits depend on how they were computed.

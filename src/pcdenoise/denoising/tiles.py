@@ -32,12 +32,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdenoise.cloud import drift
-from pcdenoise.cloud.neighbours import Distances, NeighbourSearch, coordinate_hash, distinct_by, drawn_by, spatial_order
+from pcdenoise.cloud.neighbours import Distances, Identity, NeighbourSearch, coordinate_hash, distinct_by, drawn_by, spatial_order
 from pcdenoise.cloud.noise_level import N_PROBES, NoiseLevel, estimate_from
 from pcdenoise.cloud.scan import Mask, Points, check_extent
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import classical, denoiser, outliers, risk, uncertainty
-from pcdenoise.denoising.denoiser import Identity, Progress
+from pcdenoise.denoising.denoiser import Progress
 from pcdenoise.denoising.seeds import share_of_seeds
 from pcdenoise.networks.store import Model
 from pcdenoise.whole_files import replaced

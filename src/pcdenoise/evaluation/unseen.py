@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdenoise.cloud import noise_level
-from pcdenoise.cloud.neighbours import NeighbourSearch, spatial_order
+from pcdenoise.cloud.neighbours import NeighbourSearch, principal_axes, spatial_order
 from pcdenoise.cloud.scan import Points
 
 N_PLACES = 1000
@@ -33,7 +33,7 @@ class Unseen:
         radius = np.maximum(distances[:, -1], 1e-300)
         near = (held[indices] - centres[:, None]) / radius[:, None, None]
         middle = near.mean(axis=1, keepdims=True)
-        frames = np.linalg.eigh((near - middle).transpose(0, 2, 1) @ (near - middle))[1]
+        frames = principal_axes(near - middle)
         height, u, v = np.moveaxis((near - middle) @ frames, 2, 0)
         terms = _terms(u, v)
         information = np.linalg.inv(terms.transpose(0, 2, 1) @ terms + 1e-9 * np.eye(6))

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pcdenoise.cloud.neighbours import knn
+from pcdenoise.cloud.neighbours import knn, principal_axes
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising.denoiser import denoise
 from pcdenoise.learning.dataset import Array, Draw, Surface, from_surface
@@ -43,7 +43,7 @@ def cleaned(points: Array, model: store.Model, own_law: float) -> Surface:
     clean = denoise(points, model, DenoiseConfig.model_validate({"threads": 1, "relax_steps": 0})).points
     near = clean[knn(clean, _NORMAL_POINTS, threads=1)[1]]
     near -= near.mean(axis=1, keepdims=True)
-    normals = np.linalg.eigh(near.transpose(0, 2, 1) @ near)[1][:, :, 0]
+    normals = principal_axes(near)[:, :, 0]
     disc = _DISC_SPACINGS * float(np.median(knn(clean, 4, clean[:: max(1, len(clean) // 1000)], threads=1)[0][:, -1]))
     return Surface(clean, normals, disc, points - clean, own_law)
 

@@ -12,6 +12,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pcdenoise.cloud.neighbours import principal_axes
 from pcdenoise.denoising.pyramid import descend
 from pcdenoise.learning.dataset import Array, Mask, TrainingCloud
 from pcdenoise.learning.supervised import robust
@@ -77,7 +78,7 @@ class HeldOut:
         inside = distances <= wide[:, None]
         centre = (near * inside[:, :, None]).sum(axis=1) / inside.sum(axis=1)[:, None]
         spread = (near - centre[:, None]) * inside[:, :, None]
-        frames = np.linalg.eigh(spread.transpose(0, 2, 1) @ spread)[1]
+        frames = principal_axes(spread)
         height, u, v = np.moveaxis((near - place[:, None]) @ frames, 2, 0)
         across = (u**2 + v**2) / np.minimum(wide, distances[:, -1])[:, None] ** 2
         # The cylinder: near along the surface, and up or down as far as noise goes around the middle of what is there.
