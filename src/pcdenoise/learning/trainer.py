@@ -45,7 +45,7 @@ _DEFAULT_BUDGET_S = 20 * 60.0
 _AVERAGED_STEPS = 500  # the shipped weights are a running mean over about so many steps
 _WARM_UP_STEPS = 100
 _ADAPTING_RATE = 0.1  # of the peak learning rate, for a model that has learned already
-_OWN_LAW = {True: 0.8, False: 0.3}
+_OWN_LAW = {True: 0.8, False: 0.1}
 """How often distillation puts back a scan's own noise and a synthetic cloud's, rather than a law of synthesis."""
 _JUDGED_CLOUDS = 16
 _FIRST_LAP = 0.2
