@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 import pcdenoise
-from pcdenoise.commands.denoise import picture_notes
+from pcdenoise.commands.cleaning import picture_notes
 from pcdenoise.commands.survey import unit_of
 from pcdenoise.evaluation.pictures import before_after
 

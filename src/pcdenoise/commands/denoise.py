@@ -1,39 +1,26 @@
-"""`pcdenoise denoise`: scans in, clean scans out."""
+"""`pcdenoise denoise`: scans in, clean scans out. Not here: how one of them is cleaned (cleaning.py)."""
 
 from __future__ import annotations
 
 import os
 import shutil
-import time
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from pcdenoise import __version__
 from pcdenoise.commands import files, options, outputs, selection
 from pcdenoise.commands import workers as workers_
-from pcdenoise.commands.batch import Batch, Figures
+from pcdenoise.commands.batch import Batch
+from pcdenoise.commands.cleaning import Cleaning, cells_of, refuse_model
 from pcdenoise.commands.console import Console, figure, table
 from pcdenoise.commands.files import STREAM, Job, expand, format_of, plan, refuse_existing
 from pcdenoise.commands.memory import n_bytes
 from pcdenoise.commands.options import configured, option
-from pcdenoise.commands.undo import with_colours, with_displacement, with_uncertainty
-from pcdenoise.commands.verify import MaxDrift, check_drift
-from pcdenoise.errors import ScanError, UsageError
+from pcdenoise.commands.verify import MaxDrift
+from pcdenoise.errors import UsageError
 
 if TYPE_CHECKING:
-    from pcdenoise.cloud.scan import Scan
     from pcdenoise.config import DenoiseConfig
-    from pcdenoise.denoising.denoiser import Result
-    from pcdenoise.denoising.tiles import Rows
-    from pcdenoise.evaluation.report import Page
-    from pcdenoise.io import Stream
-    from pcdenoise.networks.store import Model
-
-
-_PIECE_ROWS = 250_000
 
 Method = Annotated[
     Literal["network", "mean", "bilateral", "jet"], option("--method", help="The learned model or a classical filter.")
@@ -153,12 +140,13 @@ def denoise(
     pictures = {picture.source: picture.target for picture in drawn if picture.source in {job.source for job in jobs}}
     refuse_existing([*(job.target for job in jobs), *pictures.values(), report], overwrite or resume)
     for job in done if resume else jobs:
-        shutil.rmtree(_cells_of(job), ignore_errors=True)
+        shutil.rmtree(cells_of(job), ignore_errors=True)
     chosen = selection.Selection.of(only_class, context, roi)
     refuse_model(model, settings)
-    cleaning = _Cleaning(
-        settings, chosen, model, console, format, overwrite or is_far, drop_attributes, displacement,
-        max_drift, pictures, n_bytes(max_memory) // workers, tile, colour, report is not None,
+    cleaning = Cleaning(
+        config=settings, selection=chosen, model_name=model, console=console, format=format, overwrite=overwrite or is_far,
+        drop_attributes=drop_attributes, displacement=displacement, max_drift=max_drift, pictures=pictures,
+        max_bytes=n_bytes(max_memory) // workers, tile=tile, colour=colour, is_reported=report is not None,
     )  # fmt: skip
     if len(jobs) > 1 or is_far:
         _ = cleaning.model  # one that is missing ends the run here, not each of its inputs
@@ -168,218 +156,6 @@ def denoise(
         page = cleaning.pages[0] if len(jobs) == len(cleaning.pages) == 1 else None
         outputs.save_report(report, "denoise", cleaning.settings, batch.records, page, overwrite=overwrite)
     batch.close()
-
-
-def chosen_model(name: str | None, settings: DenoiseConfig) -> Model | None:
-    """The network to use, or None for a classical filter. Raises ModelError."""
-    refuse_model(name, settings)
-    if settings.method != "network":
-        return None
-    from pcdenoise.networks import store
-
-    return store.load(name) if name else store.load()
-
-
-def refuse_model(name: str | None, settings: DenoiseConfig) -> None:
-    """Raises UsageError where a model is named that no one would use."""
-    if settings.method != "network" and name is not None:
-        raise UsageError(f"--model {name}: --method {settings.method} uses no model; leave one of the two out")
-
-
-def _cells_of(job: Job) -> Path:
-    """The folder where a scan's cells lie while it is cleaned; whoever cleans it goes on with what is there already."""
-    return job.target.with_name(f".{job.target.name}.cells")
-
-
-def _check_unchanged(source: Path, before: os.stat_result) -> None:
-    """Raises ScanError if somebody wrote into a file that is read several times; one replaced or removed is still read."""
-    try:
-        now = source.stat()
-    except OSError:
-        return
-    if now.st_ino == before.st_ino and (now.st_size, now.st_mtime_ns) != (before.st_size, before.st_mtime_ns):
-        raise ScanError(f"{source}: changed while it was cleaned; run again once it is complete")
-
-
-@dataclass(frozen=True)
-class _Cleaning:
-    """What is the same for every scan of a run: how to clean, what to write, and pages of the last scan for its report.
-
-    overwrite: also where workers may be lost, since a target that is there then is that of a worker that was.
-    """
-
-    config: DenoiseConfig
-    selection: selection.Selection
-    model_name: str | None
-    console: Console
-    format: str | None
-    overwrite: bool
-    drop_attributes: bool
-    displacement: bool
-    max_drift: float | None
-    pictures: dict[Path, Path]
-    max_bytes: int
-    tile: int | None = None
-    colour: bool = False
-    is_reported: bool = False
-    pages: list[Page] = field(default_factory=list)
-
-    @cached_property
-    def model(self) -> Model | None:
-        """Loaded when it is first asked for, once a scan is read: faults of scans come first."""
-        return chosen_model(self.model_name, self.config)
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Everything that shaped the result, by name, for the report and the file's provenance."""
-        named = {"model": self.model.name, "model_sha256": self.model.sha256} if self.model else {}
-        colour = {"colour": True} if self.colour else {}
-        return {**self.config.model_dump(mode="json"), **self.selection.settings, **named, **colour}
-
-    def clean(self, job: Job) -> Figures:
-        """Reads one scan, cleans it, writes it with its picture, and returns its figures; in cells on disk if it is too large."""
-        from pcdenoise import io
-        from pcdenoise.denoising.tiles import needed_bytes
-
-        with io.streamed(job.source, format=format_of(job.source, self.format)) as stream:
-            if stream is not None and (self.tile or needed_bytes(stream.n_points) > self.max_bytes):
-                return self._clean_in_cells(job, stream)
-        if self.tile:
-            self.console.note(f"{job.source}: read whole; only LAS, LAZ, binary PLY and text files are cleaned in cells")
-        return self._clean_whole(job)
-
-    def _clean_in_cells(self, job: Job, stream: Stream) -> Figures:
-        """The same for a scan that need not fit in memory: rows are streamed, cells lie in a folder beside the target."""
-        from pcdenoise import io
-        from pcdenoise.denoising.tiles import Tiles, needs_the_whole, points_per_cell
-
-        started = time.perf_counter()
-        written = format_of(job.target, self.format) or io.SUFFIXES.get(job.target.suffix.lower(), stream.format)
-        global_ = needs_the_whole(self.model, self.config)
-        for is_asked, fault in (
-            (self.config.outliers == "remove", "--outliers remove: use --outliers flag"),
-            (self.colour, "--colour: leave it out"),
-            (self.selection != selection.Selection(), "--only-class and --roi: leave them out"),
-            (global_, f"{global_}: leave it out"),
-            (job.source in self.pictures, "--picture: leave it out"),
-            (not io.same_kind(stream.format, written), f"conversion to {written}: keep {stream.format}"),
-            (job.target == STREAM, "output to a pipe: write to a file"),
-        ):
-            if is_asked:
-                raise UsageError(
-                    f"{job.source}: {stream.n_points:,} points are cleaned in cells, which does not go with {fault}, "
-                    "or raise --max-memory"
-                )
-        cell_points = self.tile or points_per_cell(self.max_bytes)
-        job.target.parent.mkdir(parents=True, exist_ok=True)
-        folder = _cells_of(job)
-        about = job.source.stat()
-
-        def read() -> Iterator[Scan]:
-            for piece in stream.pieces(_PIECE_ROWS):
-                _check_unchanged(job.source, about)
-                yield piece
-
-        tiles = Tiles(
-            folder, lambda: (piece.points for piece in read()), self.model, self.config, cell_points,
-            {"source": str(job.source.resolve()), "size": about.st_size, "changed": about.st_mtime_ns, "version": __version__},
-        )  # fmt: skip
-        self.console.detail(f"{job.source}: {stream.n_points:,} points in cells of {cell_points:,}, kept in {folder}")
-        with self.console.progress(job.source.name) as on_progress:
-            tiles.run(on_progress)
-            check_drift(job.target, tiles.figures["drift"], tiles.figures["noise"], self.max_drift)
-            pieces = (self._piece(scan, rows) for scan, rows in zip(read(), tiles.rows(), strict=True))
-            io.write_streamed(
-                stream, pieces, job.target, format=format_of(job.target, self.format), overwrite=self.overwrite,
-                provenance=outputs.provenance("denoise", self.settings),
-            )  # fmt: skip
-        tiles.remove()
-        figures = {"points": stream.n_points, **tiles.figures, "seconds": round(time.perf_counter() - started, 3)}
-        self.console.note(f"{job.target}: {_summary(figures)}")
-        return figures
-
-    def _piece(self, scan: Scan, rows: Rows) -> Scan:
-        """Some rows moved, with the columns that were asked for."""
-        cleaned = scan.moved_to(rows.points)
-        if self.displacement:
-            cleaned = with_displacement(scan.points, cleaned)
-        if rows.std is not None:
-            cleaned = with_uncertainty(cleaned, rows.std)
-        return cleaned.with_attributes(outlier=rows.outlier.astype("u1")) if self.config.outliers == "flag" else cleaned
-
-    def _clean_whole(self, job: Job) -> Figures:
-        from pcdenoise import io
-        from pcdenoise.commands.survey import traps, unit_of
-        from pcdenoise.denoising import denoiser
-        from pcdenoise.denoising.part import denoise_part
-
-        started = time.perf_counter()
-        self.console.detail(f"{job.source}: reading")
-        scan = io.read(job.source, format=format_of(job.source, self.format))
-        with self.console.progress(job.source.name) as on_progress:
-            if self.selection == selection.Selection():
-                result = denoiser.denoise(scan.points, self.model, self.config, on_progress)
-            else:
-                result = denoise_part(scan.points, *self.selection.masks(scan), self.model, self.config, on_progress)
-        for step in result.steps:
-            self.console.detail(", ".join(f"{name.replace('_', ' ')} {figure(value)}" for name, value in step.figures.items()))
-        check_drift(job.target, result.figures["drift"], result.figures["noise"], self.max_drift)
-        job.target.parent.mkdir(parents=True, exist_ok=True)
-        io.write(
-            self._marked(scan, result), job.target, format=format_of(job.target, self.format), overwrite=self.overwrite,
-            drop_attributes=self.drop_attributes, provenance=outputs.provenance("denoise", self.settings),
-        )  # fmt: skip
-        figures = {"points": len(scan), **result.figures, "seconds": round(time.perf_counter() - started, 3)}
-        unit = unit_of(scan)
-        if picture := self.pictures.get(job.source):
-            outputs.save_before_after(
-                picture, scan, result.points, notes=picture_notes(result, unit), unit=unit, overwrite=self.overwrite
-            )
-        if self.is_reported:
-            from pcdenoise.evaluation.report import Page
-
-            self.pages[:] = [Page(scan.points, result.points, colours=outputs.colours(scan), unit=unit)]
-        for text in traps(scan, figures["noise"] if figures["is_surface"] else None):
-            self.console.note(f"{job.source}: {text}")
-        self.console.note(f"{job.target}: {_summary(figures)}" + (f"; picture {picture}" if picture else ""))
-        return figures
-
-    def _marked(self, scan: Scan, result: Result) -> Scan:
-        """The moved scan with the columns that were asked for, without the rows that were not wanted."""
-        from pcdenoise import io
-
-        cleaned = scan.moved_to(result.points)
-        if self.colour:
-            cleaned = with_colours(scan, cleaned, undoable=self.displacement, threads=self.config.threads)
-        if self.displacement:
-            cleaned = with_displacement(scan.points, cleaned)
-        if result.std is not None:
-            cleaned = with_uncertainty(cleaned, result.std)
-        if self.config.outliers == "flag":
-            cleaned = cleaned.with_attributes(outlier=result.outlier.astype("u1"))
-        return io.select(cleaned, ~result.outlier) if self.config.outliers == "remove" else cleaned
-
-
-def picture_notes(result: Result, unit: str) -> tuple[str, str]:
-    """What a picture says under its titles: how far points were off, and how far they moved."""
-    if not result.steps:
-        return "no surface shows", "nothing moved"
-    unit = f" {unit}" if unit else ""
-    return f"noise {figure(result.figures['noise'])}{unit}", f"moved by {figure(result.figures['move_median'])}{unit}, median"
-
-
-def _summary(figures: Figures) -> str:
-    """One line for a person: how many points, how noisy they were, how far they moved, what was left alone."""
-    parts = [f"{figures['points']:,} points"]
-    if "points_selected" in figures:
-        parts.append(f"{figures['points_selected']:,} selected")
-    parts.append(f"noise {figure(figures['noise'])}" if figures["is_surface"] else "no surface to clean")
-    parts.append(f"moved {figure(figures['move_median'])} (median), at most {figure(figures['move_max'])}")
-    if figures["points_left_alone"]:
-        parts.append(f"{figures['points_left_alone']:,} left alone")
-    if figures["outliers"]:
-        parts.append(f"{figures['outliers']:,} outliers")
-    return ", ".join([*parts, f"{figures['seconds']:.1f} s"])
 
 
 def _plan_text(sources: list[Path], output: str, suffix: str, format: str | None, settings: DenoiseConfig) -> str:

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pcdenoise.commands import options, outputs
+from pcdenoise.commands.cleaning import chosen_model
 from pcdenoise.commands.console import Console, figure, table
-from pcdenoise.commands.denoise import Iters, Method, Neighbours, Radius, SigmaD, SigmaN, Unshrink, chosen_model
+from pcdenoise.commands.denoise import Iters, Method, Neighbours, Radius, SigmaD, SigmaN, Unshrink
 from pcdenoise.commands.files import format_of, refuse_existing
 from pcdenoise.commands.options import argument, configured, option
 
