@@ -62,6 +62,8 @@ def test_denoise_moves_points_and_keeps_rows_and_attributes(sphere: Path) -> Non
         (["info", "broken.las"], 3, "broken.las"),
         (["denoise", "sphere.xyz", "-o", "x.xyz", "--method", "magic"], 2, "method"),
         (["denoise", "sphere.xyz", "-o", "x.xyz", "--strength", "1.5"], 2, "--strength"),
+        (["denoise", "sphere.xyz", "-o", "x.xyz", "--noise", "0"], 2, "--noise"),
+        (["denoise", "sphere.xyz", "-o", "x.xyz", "--noise", "inf"], 2, "--noise"),
         (["denoise", "sphere.xyz", "-o", "x.xyz", "--iters", "0"], 2, "--iters"),
         (["denoise", "sphere.xyz", "-o", "x.xyz", "--iters", "many"], 2, "--iters"),
         (["denoise", "sphere.xyz", "-o", "x.xyz", "--max-move", "-1"], 2, "--max-move"),

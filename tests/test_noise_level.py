@@ -61,6 +61,16 @@ def test_the_scale_that_shows_the_surface_grows_with_the_variance_of_the_noise_a
         assert found.scale_points == pytest.approx(np.pi * (4.5 * ratio * std_spacings) ** 2, rel=0.25)
 
 
+@pytest.mark.parametrize("share", [0.2, 1.0, 3.0])
+def test_noise_that_is_known_is_taken_as_it_is_and_tells_the_scale(share: float) -> None:
+    found = cloud("plane", 16_000, 1.0)
+    std = share * found.spacing
+    told = estimate(found.noisy, threads=1, known_std=std)
+    assert (told.std, told.is_surface) == (std, True)
+    assert told.spacing == estimate(found.noisy, threads=1).spacing
+    assert told.scale_points == pytest.approx(max(1, np.pi * (4.5 * share) ** 2), rel=0.3)
+
+
 @pytest.mark.parametrize("n", [300, 4000, 20_000])
 @pytest.mark.parametrize("name", NO_SURFACE)
 def test_a_filled_volume_is_no_surface(rng: np.random.Generator, name: str, n: int) -> None:

@@ -45,6 +45,7 @@ CASES = {
     "until it stops by itself": (0.5, {"iters": "auto"}, 4),
     "half the way": (0.5, {"strength": 0.5, "max_move": 0.02, "outliers": "flag"}, 5),
     "with uncertainty": (0.5, {"uncertainty": True, "max_move": 0.05}, 7),
+    "noise that is known": (0.3, {"noise": 0.02, "iters": 2}, 8),
     "jets": (0.5, {"method": "jet"}, 6),
     "bilateral": (0.5, {"method": "bilateral"}, 6),
 }

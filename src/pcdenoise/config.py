@@ -26,6 +26,9 @@ class DenoiseConfig(Settings):
     iters: Annotated[int, Field(ge=1, le=100)] | Literal["auto"] = Field(
         1, description="Passes over the scan; auto stops by itself, without ground truth."
     )
+    noise: float | None = Field(
+        None, gt=0, allow_inf_nan=False, description="Standard deviation of the noise, in the scan's unit; estimated by default."
+    )
     strength: float = Field(1.0, ge=0, le=1, description="Share of the move that is carried out.")
     max_move: float | None = Field(None, gt=0, description="Longest move of any point, in the scan's unit.")
     relax_steps: int = Field(4, ge=0, le=100, description="Steps toward even spacing, within the noise; 0 for none.")

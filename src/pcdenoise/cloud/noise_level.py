@@ -55,15 +55,16 @@ class NoiseLevel:
     is_surface: bool
 
 
-def estimate(points: Points, seed: int = 0, threads: int = -1) -> NoiseLevel:
+def estimate(points: Points, seed: int = 0, threads: int = -1, known_std: float | None = None) -> NoiseLevel:
     """The noise level of (N, 3) finite points from a fixed number of probes, at a cost that hardly grows with N.
 
     Neighbourhoods grow until a share of all places shows a surface; the noise is what a quadric height field leaves there,
     its six degrees of freedom given back. Exact duplicates count once. Fewer than 16 distinct points give std 0 and no surface.
+    known_std: the noise where somebody knows it; what remains to be found is the scale at which the surface shows under it.
     """
     points = points[distinct(points)[0]]
     points = points[spatial_order(points)]
-    return estimate_at(points, probes(drawn_by(coordinate_hash(points, 0), seed)), threads)
+    return estimate_at(points, probes(drawn_by(coordinate_hash(points, 0), seed)), threads, known_std)
 
 
 def probes(hashes: NDArray[np.uint64]) -> Indices:
@@ -73,7 +74,7 @@ def probes(hashes: NDArray[np.uint64]) -> Indices:
     return np.sort(np.argpartition(hashes, N_PROBES)[:N_PROBES])
 
 
-def estimate_at(points: Points, rows: Indices, threads: int = -1) -> NoiseLevel:
+def estimate_at(points: Points, rows: Indices, threads: int = -1, known_std: float | None = None) -> NoiseLevel:
     """`estimate` for (N, 3) points that are distinct and in spatial order already, at the probes in these rows."""
     search = NeighbourSearch(points, threads)
 
@@ -81,21 +82,21 @@ def estimate_at(points: Points, rows: Indices, threads: int = -1) -> NoiseLevel:
         distances, indices = search.knn(centres, k)
         return distances, points[indices]
 
-    return estimate_from(points[rows], len(points), nearest)
+    return estimate_from(points[rows], len(points), nearest, known_std)
 
 
 Nearest = Callable[[Points, int], tuple[Distances, Points]]
 """(M, k) distances and (M, k, 3) positions of the k points nearest to (M, 3) points of the cloud, nearest first."""
 
 
-def estimate_from(probed: Points, n_points: int, nearest: Nearest) -> NoiseLevel:
+def estimate_from(probed: Points, n_points: int, nearest: Nearest, known_std: float | None = None) -> NoiseLevel:
     """`estimate` at (M, 3) probes of a cloud that only `nearest` knows; it is asked for up to 2048 neighbours."""
     if n_points < 2:
-        return NoiseLevel(0.0, 0.0, float(_LADDER[0]), False)
+        return NoiseLevel(known_std or 0.0, 0.0, float(_LADDER[0]), False)
     probed = probed[spatial_order(probed)]
     spacing = float(np.median(nearest(probed, 2)[0][:, 1]))
     if n_points < _LADDER[0]:
-        return NoiseLevel(0.0, spacing, float(_LADDER[0]), False)
+        return NoiseLevel(known_std or 0.0, spacing, float(_LADDER[0]), False)
 
     rungs: list[_Rung] = []
     for k in (k for k in _LADDER if k <= n_points):
@@ -106,12 +107,13 @@ def estimate_from(probed: Points, n_points: int, nearest: Nearest) -> NoiseLevel
         clear = float(np.quantile(aspect, 1 - _CLEARER_SHARE))
         std = float(np.median((radius / aspect)[aspect >= np.quantile(aspect, 0.5)]))
         rungs.append(_Rung(k, float(np.median(radius)), clear, std / _share_seen(clear)))
-        if clear >= _SURFACE_ASPECT and rungs[-1].radius >= _SCALE_STDS * rungs[-1].std:
+        if clear >= _SURFACE_ASPECT and rungs[-1].radius >= _SCALE_STDS * (known_std or rungs[-1].std):
             break
     shown = [rung for rung in rungs if rung.aspect >= _SURFACE_ASPECT]
     if not shown:
-        return NoiseLevel(max(rungs, key=lambda rung: rung.aspect).std, spacing, float(_LADDER[0]), False)
-    std = shown[0].std
+        std = known_std or max(rungs, key=lambda rung: rung.aspect).std
+        return NoiseLevel(std, spacing, float(_LADDER[0]), False)
+    std = known_std or shown[0].std
     certain = shown[0].k <= _SMALL_SHARE * n_points or max(rung.aspect for rung in shown) >= _CERTAIN_ASPECT
     return NoiseLevel(std, spacing, _points_within(_SCALE_STDS * std, rungs), certain)
 

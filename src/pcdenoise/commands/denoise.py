@@ -35,6 +35,10 @@ Unshrink = Annotated[
     bool | None,
     option("--unshrink/--shrink", help="Take moves that whole regions share back; by default with mcconv models only."),
 ]
+Noise = Annotated[
+    float | None,
+    option("--noise", metavar="STD", help="Noise as a standard deviation in the file's unit; estimated if not given."),
+]
 Iters = Annotated[str, option("--iters", metavar="N|auto", help="Passes; auto stops when the next would not help.")]
 
 
@@ -44,6 +48,7 @@ def denoise(
     model: options.Model = None,
     method: Method = "network",
     iters: Iters = "1",
+    noise: Noise = None,
     unshrink: Unshrink = None,
     neighbours: Neighbours = None,
     radius: Radius = None,
@@ -112,7 +117,7 @@ def denoise(
     from pcdenoise.config import DenoiseConfig
 
     settings = configured(
-        DenoiseConfig, method=method, iters=iters, strength=strength, max_move=max_move, outliers=outliers,
+        DenoiseConfig, method=method, iters=iters, noise=noise, strength=strength, max_move=max_move, outliers=outliers,
         unshrink=unshrink, neighbours=neighbours, radius=radius, sigma_d=sigma_d, sigma_n=sigma_n, uncertainty=uncertainty,
         seed=seed, threads=threads,
     )  # fmt: skip

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pcdenoise.commands import options, outputs
 from pcdenoise.commands.cleaning import chosen_model
 from pcdenoise.commands.console import Console, figure, table
-from pcdenoise.commands.denoise import Iters, Method, Neighbours, Radius, SigmaD, SigmaN, Unshrink
+from pcdenoise.commands.denoise import Iters, Method, Neighbours, Noise, Radius, SigmaD, SigmaN, Unshrink
 from pcdenoise.commands.files import format_of, refuse_existing
 from pcdenoise.commands.options import argument, configured, option
 
@@ -24,6 +24,7 @@ def iterate(
     model: options.Model = None,
     method: Method = "network",
     iters: Iters = "5",
+    noise: Noise = None,
     unshrink: Unshrink = None,
     neighbours: Neighbours = None,
     radius: Radius = None,
@@ -50,8 +51,8 @@ def iterate(
     from pcdenoise.synthesis.meshes import load_mesh
 
     settings = configured(
-        DenoiseConfig, method=method, iters=iters, unshrink=unshrink, neighbours=neighbours, radius=radius, sigma_d=sigma_d,
-        sigma_n=sigma_n, seed=seed, threads=threads,
+        DenoiseConfig, method=method, iters=iters, noise=noise, unshrink=unshrink, neighbours=neighbours, radius=radius,
+        sigma_d=sigma_d, sigma_n=sigma_n, seed=seed, threads=threads,
     )  # fmt: skip
     strip, report = output / "passes.png", output / "report.html"
     refuse_existing([strip, report], overwrite)

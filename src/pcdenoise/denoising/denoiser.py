@@ -152,7 +152,7 @@ class _Cloud:
         self.identity: Identity = identity[first][order]
         self._row = back[place]
         self.probes = probes(drawn_by(self.identity, config.seed))
-        self.level: NoiseLevel = level or estimate_at(self.start, self.probes, self.threads)
+        self.level: NoiseLevel = level or estimate_at(self.start, self.probes, self.threads, config.noise)
         self.diagonal = float(np.linalg.norm(np.ptp(self.start, axis=0))) if len(self.start) else 0.0
 
     def to_rows(self, values: NDArray[Any], missing: Any) -> NDArray[Any]:

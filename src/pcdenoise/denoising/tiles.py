@@ -299,7 +299,7 @@ class Tiles:
             pairs = [kept[centre.tobytes()] for centre in centres]
             return np.stack([distances[:k] for distances, _ in pairs]), np.stack([near[:k] for _, near in pairs])
 
-        found = estimate_from(probed, plan["n_distinct"], around)
+        found = estimate_from(probed, plan["n_distinct"], around, None if number else self.config.noise)
         self._gathered = {}
         _write(path, json.dumps(asdict(found)).encode())
         return found
