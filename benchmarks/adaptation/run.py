@@ -85,9 +85,9 @@ def trial(case: Case, folder: Path, budget_s: float | None, steps: int | None) -
         return {**about, "steps": 0, "adapted": math.nan, "learned": math.nan, "verdict": "nothing was learned"}
     judge = trainer._Run.judge
 
-    def remembering(run: trainer._Run, before: Any, clouds: Any) -> None:
+    def remembering(run: trainer._Run, *given: Any) -> None:
         store.save(run.average, folder / "learned", summary="", training={}, scores={}, card="")
-        judge(run, before, clouds)
+        judge(run, *given)
 
     trainer._Run.judge = remembering  # type: ignore[method-assign]
     try:

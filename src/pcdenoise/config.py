@@ -86,7 +86,10 @@ class TrainConfig(Settings):
     steps: int | None = Field(None, ge=1, description="Clouds to learn from; or give a budget.")
     budget_s: float | None = Field(None, gt=0, description="Seconds to learn for; or give steps.")
     learning_rate: float | None = Field(
-        None, gt=0, le=1, description="Peak learning rate; by default 0.003 for projection, 0.005 for mcconv, as in the paper."
+        None,
+        gt=0,
+        le=1,
+        description="Peak learning rate; by default 0.003 for projection, a tenth of it to adapt a model, 0.005 for mcconv.",
     )
     seed: int = Field(1, ge=0, description="Seed of surfaces, noise and initial weights.")
     threads: int | None = Field(None, ge=1, description="Processor threads; all of them by default.")

@@ -44,7 +44,10 @@ def train(
     neighbours: Annotated[int, option("--neighbours", help="projection: how many neighbours a point looks at.")] = 32,
     learning_rate: Annotated[
         float | None,
-        option("--learning-rate", help="The highest, by default 0.003 for projection and 0.005 for mcconv; it decays."),
+        option(
+            "--learning-rate",
+            help="The highest; by default 0.003 for projection, a tenth of it to adapt a model, 0.005 for mcconv.",
+        ),
     ] = None,
     prior: Annotated[
         Literal["full", "space", "none"],
@@ -66,7 +69,9 @@ def train(
         int, _prior("--laps", min=1, max=20, help="distill: how often what was learned so far becomes the teacher.")
     ] = 2,
     steps: Annotated[int | None, option("--steps", min=1, help="Stop after so many steps.")] = None,
-    budget: Annotated[str | None, option("--budget", metavar="TIME", help="Stop after so long: 90s, 20m, 1.5h.")] = None,
+    budget: Annotated[
+        str | None, option("--budget", metavar="TIME", help="Learn for so long: 90s, 20m, 1.5h. By default 20m.")
+    ] = None,
     init: Annotated[
         str | None, option("--init", metavar="NAME|DIR", help="Start from this model, or none; scans: default.")
     ] = None,
@@ -95,23 +100,31 @@ def train(
     refuse_existing([output / "config.json"], overwrite or resume)
     refuse_existing([report], overwrite)
     console = Console(quiet or not ranks.is_first())
+    if overwrite and not resume and ranks.is_first():
+        trainer.discard(output)
     with console.progress("train") as on_progress:
         summary = trainer.train(settings, output, init=init, resume=resume, on_progress=on_progress)
     if report and ranks.is_first():
-        _save_report(report, output, settings.model_dump(mode="json"), asdict(summary), overwrite)
+        _save_report(report, output, asdict(summary), overwrite)
     console.note(f"{output}: {summary}")
 
 
-def _save_report(path: Path, output: Path, settings: dict[str, Any], figures: dict[str, Any], overwrite: bool) -> None:
-    """Figures and settings of a run, as HTML with its curve."""
+def _save_report(path: Path, output: Path, figures: dict[str, Any], overwrite: bool) -> None:
+    """Figures of a run and settings as it settled them, as HTML with its curve."""
     from pcdenoise.evaluation.charts import curve
     from pcdenoise.evaluation.report import Page
     from pcdenoise.learning.trainer import LOG
+    from pcdenoise.networks import store
+
+    model = store.load(output)
+    settings = {**model.config.training, "model": model.name, "model_sha256": model.sha256}
 
     log = output / LOG
     lines = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
     errors = {"": [line["error"] for line in lines]}
-    chart = curve(errors, title="Error, of the noise", x_label="Step", x=[line["step"] for line in lines])
+    chart = curve(
+        errors, title="Root mean square distance to the targets, of the noise", x_label="Step", x=[line["step"] for line in lines]
+    )
     files = [{"input": ", ".join(settings["data"] or []), "output": str(output), "status": "done", "figures": figures}]
     outputs.save_report(path, "train", settings, files, Page(charts=[chart] if lines else []), overwrite=overwrite)
 

@@ -5,8 +5,6 @@ Here: the loss and the judgement of weights by it. Not here: which points are he
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
@@ -48,10 +46,10 @@ def split_loss(network: ProjectionNetwork, cloud: TrainingCloud) -> tuple[Tensor
     return loss + robust(error), error.square().mean()
 
 
-def judge(network: ProjectionNetwork, clouds: Iterable[TrainingCloud]) -> Array:
-    """(C,) the error of `split_loss` on each cloud, for comparing weights without truth."""
+def judge(network: ProjectionNetwork, cloud: TrainingCloud) -> float:
+    """The error of `split_loss` on a cloud, for comparing weights without truth; NaN where too little is held out."""
     with torch.no_grad():
-        return np.array([float(split_loss(network, cloud)[1]) for cloud in clouds])
+        return float(split_loss(network, cloud)[1])
 
 
 class HeldOut:

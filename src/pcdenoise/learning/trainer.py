@@ -44,7 +44,7 @@ _SAVE_EVERY, _LOG_EVERY = 200, 50
 _DEFAULT_BUDGET_S = 20 * 60.0
 _AVERAGED_STEPS = 500  # the shipped weights are a running mean over about so many steps
 _WARM_UP_STEPS = 100
-_ADAPTING_RATE = 0.1  # of the peak learning rate, for a model that has learned already
+_ADAPTING_RATE = 3e-4  # peak learning rate for a model that has learned already
 _OWN_LAW = {True: 0.8, False: 0.1}
 """How often distillation puts back a scan's own noise and a synthetic cloud's, rather than a law of synthesis."""
 _JUDGED_CLOUDS = 16
@@ -52,10 +52,15 @@ _FIRST_LAP = 0.2
 """Share of a distillation whose teacher has learned nothing yet; the laps after it are equally long."""
 
 
+OnProgress = Callable[[str, float], None]
+"""Called with what is being done and the share of it that is done, 0 to 1."""
+
+
 @dataclass(frozen=True)
 class TrainingSummary:
-    """What a run did. error: mean squared distance to the surface over squared noise in the last hundred steps.
+    """What a run did. error: root mean square distance to the targets in the last hundred steps, of the noise.
 
+    The targets are on the surface; with `total` they are the points that its prior draws.
     verdict: which weights are kept after an adaptation, and why; else empty.
     """
 
@@ -67,7 +72,7 @@ class TrainingSummary:
 
     def __str__(self) -> str:
         minutes = self.seconds / 60
-        done = f"{self.steps} steps, {self.points / 1e6:.1f} M points, {minutes:.1f} min, error {self.error:.3f} of the noise"
+        done = f"{self.steps:,} steps, {self.points:,} points, {minutes:.1f} min, {self.error:.3f} of the noise off its targets"
         return f"{done}; {self.verdict}" if self.verdict else done
 
 
@@ -77,7 +82,7 @@ def train(
     *,
     init: str | None = None,
     resume: bool = False,
-    on_progress: Callable[[str, float], None] | None = None,
+    on_progress: OnProgress | None = None,
 ) -> TrainingSummary:
     """Learns from the surfaces or scans in `config.data` and writes the model folder `output`.
 
@@ -85,18 +90,27 @@ def train(
     Where split or distill learn from scans alone, the shipped model is adapted to them unless `init` says otherwise ("none": a
     new network), and comes back as it was unless the change shows on a quarter of the points, which no step learns from.
     Under torchrun each process learns from clouds of its own, gradients are averaged, and the first process writes.
-    Raises UsageError when there is nothing to resume or to learn from.
+    Raises UsageError when there is nothing to resume or to learn from, and when a run is resumed with other settings.
     """
     if config.threads:
         torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
+    if resume and init is None:
+        init = _record(output / CHECKPOINT).get("init")
     config, init, adapts = _settled(config, init)
-    output.mkdir(parents=True, exist_ok=True)
     with joined() as ranks:
-        return _trained(_Run(config, output, _initial(config, init), ranks), adapts, resume, on_progress)
+        run = _Run(config, output, _initial(config, init), ranks, init)
+        return _trained(run, adapts, resume, on_progress or (lambda _words, _share: None))
 
 
-def _trained(run: _Run, adapts: bool, resume: bool, on_progress: Callable[[str, float], None] | None) -> TrainingSummary:
+def discard(output: Path) -> None:
+    """Forgets what an unfinished run left in its folder, so that another one can begin there; a model in it stays."""
+    (output / CHECKPOINT).unlink(missing_ok=True)
+    for teacher in output.glob(f"{TEACHER}-*"):
+        shutil.rmtree(teacher)
+
+
+def _trained(run: _Run, adapts: bool, resume: bool, on_progress: OnProgress) -> TrainingSummary:
     config, output, ranks = run.config, run.output, run.ranks
     before = copy.deepcopy(run.network) if adapts else None
     if resume:
@@ -105,6 +119,9 @@ def _trained(run: _Run, adapts: bool, resume: bool, on_progress: Callable[[str, 
         raise UsageError(f"{output}: holds an unfinished run; give --resume to go on with it, or another folder")
     with tempfile.TemporaryDirectory(prefix="pcdenoise-clouds-") as cache:
         lessons = _lessons(config, Path(cache), adapts)
+        output.mkdir(parents=True, exist_ok=True)
+        if ranks.is_first and not resume:
+            discard(output)
         try:
             for lap in range(lessons.laps):
                 until = 1.0 if lap + 1 == lessons.laps else _FIRST_LAP + (1 - _FIRST_LAP) * lap / (lessons.laps - 1)
@@ -116,17 +133,20 @@ def _trained(run: _Run, adapts: bool, resume: bool, on_progress: Callable[[str, 
                     if run.progress >= until:
                         break
                     run.learn(lessons.signal, cloud)
-                    if on_progress is not None:
-                        on_progress(f"step {run.step}, error {run.recent_error:.3f}", run.progress)
+                    on_progress(f"step {run.step}, {run.recent_error:.3f} of the noise off", run.progress)
             if isinstance(before, ProjectionNetwork) and ranks.is_first:
-                run.judge(before, _judges(config, Path(cache), before.config.neighbours))
+                run.judge(before, _judges(config, Path(cache), before.config.neighbours), on_progress)
+            if not run.points and not adapts:
+                raise UsageError(
+                    f"{output}: no cloud taught anything in {run.step} steps; learn for longer, or from larger scans"
+                )
         finally:
-            if ranks.is_first:
+            if ranks.is_first and run.points:
                 run.save_model()
     if ranks.is_first:
-        (output / CHECKPOINT).unlink(missing_ok=True)
-        for teacher in output.glob(f"{TEACHER}-*"):
-            shutil.rmtree(teacher)
+        if not run.points:
+            run.save_model()
+        discard(output)
     return run.summary
 
 
@@ -143,7 +163,7 @@ def _settled(config: TrainConfig, init: str | None) -> tuple[TrainConfig, str | 
         learned = store.load(init).network
         if isinstance(learned, ProjectionNetwork):
             changes["neighbours"] = learned.config.neighbours
-        changes["learning_rate"] = config.learning_rate or _ADAPTING_RATE * _PLANS["projection"].learning_rate
+        changes["learning_rate"] = config.learning_rate or _ADAPTING_RATE
     return config.model_copy(update=changes), init, adapts
 
 
@@ -230,8 +250,8 @@ def _initial(config: TrainConfig, init: str | None) -> store.Network:
 class _Run:
     """Weights, their running mean, the optimiser and the record of one training run."""
 
-    def __init__(self, config: TrainConfig, output: Path, network: store.Network, ranks: Ranks) -> None:
-        self.config, self.output, self.network, self.ranks = config, output, network, ranks
+    def __init__(self, config: TrainConfig, output: Path, network: store.Network, ranks: Ranks, init: str | None) -> None:
+        self.config, self.output, self.network, self.ranks, self.init = config, output, network, ranks, init
         self.average = copy.deepcopy(network)
         self._plan = _PLANS[config.network]
         self._peak = config.learning_rate or self._plan.learning_rate
@@ -239,6 +259,7 @@ class _Run:
         self.step, self.points, self._before_s, self._began = 0, 0, 0.0, time.monotonic()
         self._errors: list[float] = []
         self._verdict = ""
+        self._logged = 0
 
     @property
     def seconds(self) -> float:
@@ -254,8 +275,8 @@ class _Run:
 
     @property
     def recent_error(self) -> float:
-        """Mean error of the last hundred clouds, infinite before the first."""
-        return sum(self._errors) / len(self._errors) if self._errors else math.inf
+        """Root mean square error of the last hundred clouds, infinite before the first."""
+        return math.sqrt(sum(self._errors) / len(self._errors)) if self._errors else math.inf
 
     @property
     def summary(self) -> TrainingSummary:
@@ -302,23 +323,31 @@ class _Run:
         torch.autograd.backward(loss)
         return [float(error.detach())]
 
-    def judge(self, before: ProjectionNetwork, clouds: list[TrainingCloud]) -> None:
+    def judge(self, before: ProjectionNetwork, clouds: list[TrainingCloud], on_progress: OnProgress) -> None:
         """Goes back to the weights of `before` unless what was learned is better on held-out points, by two standard errors."""
         assert isinstance(self.average, ProjectionNetwork)
-        old, new = judge(before, clouds), judge(self.average, clouds)
+        errors = np.full((2, len(clouds)), math.nan)
+        for i, cloud in enumerate(clouds):
+            errors[:, i] = judge(before, cloud), judge(self.average, cloud)
+            on_progress("judging", (i + 1) / len(clouds))
+        old, new = errors
         known = np.isfinite(old) & np.isfinite(new)
         gain = old[known] - new[known]
         better = len(gain) > 1 and gain.mean() > 2 * gain.std(ddof=1) / math.sqrt(len(gain))
         if not better:
             self.average.load_state_dict(before.state_dict())
-        means = [float(np.mean(errors[known])) if known.any() else math.nan for errors in (old, new)]
+        if not known.any():
+            self._verdict = "too few points were held out to judge by: the starting weights are kept"
+            return
         kept = "the adapted" if better else "the starting"
-        self._verdict = f"over held-out points {means[0]:.4f} before, {means[1]:.4f} after: {kept} weights are kept"
+        heights = [math.sqrt(float(squared[known].mean())) for squared in (old, new)]
+        self._verdict = f"over held-out points {heights[0]:.4f} before, {heights[1]:.4f} after: {kept} weights are kept"
 
     def _log(self) -> None:
         line = {"step": self.step, "error": self.recent_error, "points": self.points, "seconds": round(self.seconds, 1)}
-        with (self.output / LOG).open("a") as log:
+        with (self.output / LOG).open("a" if self._logged else "w") as log:
             log.write(json.dumps(line) + "\n")
+        self._logged = self.step
 
     def save(self) -> None:
         """Everything that `load` needs, as safetensors: weights, running mean, the optimiser's moments, the record."""
@@ -330,37 +359,56 @@ class _Run:
             for key, value in self.optimiser.state.get(parameter, {}).items():
                 tensors[f"{key}.{name}"] = value
         record = {"step": self.step, "points": self.points, "seconds": self.seconds, "errors": self._errors}
+        record |= {"settings": self._settings, "init": self.init}
         part = self.output / f"{CHECKPOINT}.part"
         save_file({n: t.detach().contiguous().clone() for n, t in tensors.items()}, part, metadata={"record": json.dumps(record)})
         os.replace(part, self.output / CHECKPOINT)
 
     def load(self) -> None:
-        """Continues where `save` left off. Raises UsageError without a checkpoint, ModelError with one that does not fit."""
-        from safetensors import SafetensorError, safe_open
+        """Continues where `save` left off. Raises UsageError without a checkpoint and with other settings, ModelError with one
+        that does not fit."""
+        from safetensors import SafetensorError
+        from safetensors.torch import load_file
 
         path = self.output / CHECKPOINT
-        if not path.exists():
-            raise UsageError(f"{self.output}: nothing to resume; leave --resume out to start a run")
+        record = _record(path)
+        if others := [name for name, value in self._settings.items() if record["settings"].get(name) != value]:
+            named = ", ".join(f"--{name.replace('_', '-')} {record['settings'].get(name)}" for name in others)
+            raise UsageError(f"{self.output}: the run to resume has {named}; give the same, or start again with --overwrite")
         try:
-            with safe_open(path, framework="pt") as file:
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-                record = json.loads(file.metadata()["record"])
+            tensors = load_file(path)
             self.network.load_state_dict(_part(tensors, "network."))
             self.average.load_state_dict(_part(tensors, "average."))
         except (SafetensorError, RuntimeError, KeyError, ValueError) as fault:
-            said = in_one_line(fault)
-            raise ModelError(f"{path}: not a checkpoint of this run ({said}); leave --resume out to start again") from None
+            raise _no_checkpoint(path, fault) from None
         for name, parameter in self.network.named_parameters():
             state = {key: tensors[f"{key}.{name}"] for key in ("step", "exp_avg", "exp_avg_sq") if f"{key}.{name}" in tensors}
             if state:
                 self.optimiser.state[parameter] = state
         self.step, self.points, self._before_s = record["step"], record["points"], record["seconds"]
         self._errors, self._began = record["errors"], time.monotonic()
+        self._forget_steps_after()
+
+    def _forget_steps_after(self) -> None:
+        """Cuts from the log what was learned after the checkpoint, since it is learned again."""
+        log = self.output / LOG
+        lines = log.read_text().splitlines(keepends=True) if log.exists() else []
+        kept = [line for line in lines if json.loads(line)["step"] <= self.step]
+        if kept:
+            log.write_text("".join(kept))
+            self._logged = json.loads(kept[-1])["step"]
+
+    @property
+    def _settings(self) -> dict[str, Any]:
+        """What a run that is resumed must have in common with its beginning."""
+        return self.config.model_dump(mode="json", exclude={"threads", "steps", "budget_s"})
 
     def save_model(self) -> None:
-        """Checkpoint and model folder, the latter with the running mean of the weights."""
+        """Checkpoint, curve and model folder, the latter with the running mean of the weights."""
         self.save()
-        settings = self.config.model_dump(mode="json", exclude={"threads"})
+        if self._errors and self._logged != self.step:
+            self._log()
+        settings = self.config.model_dump(mode="json", exclude={"threads"}) | {"init": self.init}
         training = {**settings, "steps_done": self.step, "points": self.points, "minutes": round(self.seconds / 60, 1)}
         store.save(
             self.average,
@@ -372,11 +420,31 @@ class _Run:
         )
 
     def _card(self) -> str:
-        rows = "\n".join(f"| {name} | {value} |" for name, value in self.config.model_dump(mode="json").items())
+        settings = {**self.config.model_dump(mode="json"), "init": self.init}
+        rows = "\n".join(f"| {name} | {value} |" for name, value in settings.items() if value is not None)
         return (
             f"# {self.output.resolve().name}\n\nA {self.config.network} network trained with pcdenoise: {self.summary}.\n\n"
             f"| setting | value |\n| --- | --- |\n{rows}\n\nThe curve is in {LOG}.\n"
         )
+
+
+def _record(path: Path) -> dict[str, Any]:
+    """What a checkpoint says of its run. Raises UsageError without a checkpoint, ModelError with one that is none."""
+    from safetensors import SafetensorError, safe_open
+
+    if not path.exists():
+        raise UsageError(f"{path.parent}: nothing to resume; leave --resume out to start a run")
+    try:
+        with safe_open(path, framework="pt") as file:
+            record: dict[str, Any] = json.loads(file.metadata()["record"])
+            record["settings"], record["step"]
+    except (SafetensorError, KeyError, ValueError, TypeError) as fault:
+        raise _no_checkpoint(path, fault) from None
+    return record
+
+
+def _no_checkpoint(path: Path, fault: Exception) -> ModelError:
+    return ModelError(f"{path}: not a checkpoint of this run ({in_one_line(fault)}); leave --resume out to start again")
 
 
 def _gradient(parameter: nn.Parameter) -> Tensor:
