@@ -246,7 +246,7 @@ def test_a_signal_ends_the_command_with_its_code_and_leaves_nothing(number: sign
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("added", [[], ["--uncertainty"]])
+@pytest.mark.parametrize("added", [[], ["--uncertainty"], ["--outliers=flag"], ["--uncertainty", "--outliers=flag"]])
 @pytest.mark.parametrize("format", ["xyz", "ply", "pcd", "las", "laz"])
 def test_undo_gives_back_the_very_coordinates_and_attributes(format: str, added: list[str], sphere: Path) -> None:
     original, clean, back = (sphere.with_name(f"{name}.{format}") for name in ("original", "clean", "back"))
@@ -263,12 +263,25 @@ def test_undo_gives_back_the_very_coordinates_and_attributes(format: str, added:
     assert set(after.attributes) == set(before.attributes)
 
 
-def test_a_column_named_uncertainty_is_not_written_over(sphere: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("option", ["--displacement", "--uncertainty", "--outliers flag"])
+@pytest.mark.parametrize("in_cells", [[], ["--tile", "1000"]])
+def test_a_column_that_is_there_already_is_not_written_over(
+    option: str, in_cells: list[str], sphere: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     first, second = sphere.with_name("first.ply"), sphere.with_name("second.ply")
-    assert main(["denoise", str(sphere), "-o", str(first), "--uncertainty", "-q", *FAST]) == 0
-    assert main(["denoise", str(first), "-o", str(second), "--uncertainty", "-q", *FAST]) == 3
-    assert "leave out --uncertainty" in the_one_line(capsys.readouterr().err)
+    assert main(["denoise", str(sphere), "-o", str(first), *option.split(), "-q", *FAST]) == 0
+    assert main(["denoise", str(first), "-o", str(second), *option.split(), *in_cells, "-q", *FAST]) == 3
+    assert f"leave out {option}" in the_one_line(capsys.readouterr().err)
     assert not second.exists()
+
+
+def test_undo_takes_away_only_what_came_with_the_places(sphere: Path) -> None:
+    once, twice, back = (sphere.with_name(f"{name}.ply") for name in ("once", "twice", "back"))
+    assert main(["denoise", str(sphere), "-o", str(once), "--uncertainty", "-q", *FAST]) == 0
+    assert main(["denoise", str(once), "-o", str(twice), "--displacement", "--outliers", "flag", "-q", *FAST]) == 0
+    assert main(["undo", str(twice), "-o", str(back)]) == 0
+    assert main(["verify", str(once), str(back), "--max-move", "0"]) == 0
+    assert list(pcdenoise.read(back).attributes) == list(pcdenoise.read(once).attributes)
 
 
 def test_undo_is_exact_for_float32_coordinates_that_cross_zero(tmp_path: Path, rng: np.random.Generator) -> None:

@@ -18,7 +18,7 @@ from pcdenoise.commands import outputs, selection
 from pcdenoise.commands.batch import Figures
 from pcdenoise.commands.console import Console, figure
 from pcdenoise.commands.files import STREAM, Job, format_of
-from pcdenoise.commands.undo import with_colours, with_displacement, with_uncertainty
+from pcdenoise.commands.undo import refuse_taken, with_colours, with_displacement, with_outliers, with_uncertainty
 from pcdenoise.commands.verify import check_drift
 from pcdenoise.errors import ScanError, UsageError
 
@@ -100,6 +100,16 @@ class Cleaning:
         colour = {"colour": True} if self.colour else {}
         return {**self.config.model_dump(mode="json"), **self.selection.settings, **named, **colour}
 
+    @property
+    def _adding(self) -> dict[str, bool]:
+        """Which options are on that add columns."""
+        return {
+            "--displacement": self.displacement,
+            "--colour with --displacement": self.colour and self.displacement,
+            "--uncertainty": self.config.uncertainty,
+            "--outliers flag": self.config.outliers == "flag",
+        }
+
     def clean(self, job: Job) -> Figures:
         """Reads one scan, cleans it, writes it with its picture, and returns its figures; in cells on disk if it is too large."""
         from pcdenoise import io
@@ -142,6 +152,7 @@ class Cleaning:
         def read() -> Iterator[Scan]:
             for piece in stream.pieces(_PIECE_ROWS):
                 _check_unchanged(job.source, about)
+                refuse_taken(piece, self._adding)
                 yield piece
 
         tiles = Tiles(
@@ -169,7 +180,7 @@ class Cleaning:
             cleaned = with_displacement(scan.points, cleaned)
         if rows.std is not None:
             cleaned = with_uncertainty(cleaned, rows.std)
-        return cleaned.with_attributes(outlier=rows.outlier.astype("u1")) if self.config.outliers == "flag" else cleaned
+        return with_outliers(cleaned, rows.outlier) if self.config.outliers == "flag" else cleaned
 
     def _clean_whole(self, job: Job) -> Figures:
         from pcdenoise import io
@@ -180,6 +191,7 @@ class Cleaning:
         started = time.perf_counter()
         self.console.detail(f"{job.source}: reading")
         scan = io.read(job.source, format=format_of(job.source, self.format))
+        refuse_taken(scan, self._adding)
         with self.console.progress(job.source.name) as on_progress:
             if self.selection == selection.Selection():
                 result = denoiser.denoise(scan.points, self.model, self.config, on_progress)
@@ -220,7 +232,7 @@ class Cleaning:
         if result.std is not None:
             cleaned = with_uncertainty(cleaned, result.std)
         if self.config.outliers == "flag":
-            cleaned = cleaned.with_attributes(outlier=result.outlier.astype("u1"))
+            cleaned = with_outliers(cleaned, result.outlier)
         return io.select(cleaned, ~result.outlier) if self.config.outliers == "remove" else cleaned
 
 
@@ -241,6 +253,6 @@ def _summary(figures: Figures) -> str:
     parts.append(f"moved {figure(figures['move_median'])} (median), at most {figure(figures['move_max'])}")
     if figures["points_left_alone"]:
         parts.append(f"{figures['points_left_alone']:,} left alone")
-    if figures["outliers"]:
+    if figures.get("outliers"):
         parts.append(f"{figures['outliers']:,} outliers")
     return ", ".join([*parts, f"{figures['seconds']:.1f} s"])

@@ -13,10 +13,12 @@ from pcdenoise.commands.files import format_of, refuse_existing
 from pcdenoise.errors import ScanError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     import numpy as np
     from numpy.typing import NDArray
 
-    from pcdenoise.cloud.scan import Points, Scan
+    from pcdenoise.cloud.scan import Mask, Points, Scan
 
 ORIGINAL = ("original_x", "original_y", "original_z")
 DISPLACEMENT = "displacement"
@@ -24,8 +26,10 @@ DISPLACEMENT = "displacement"
 COLOUR = ("red", "green", "blue")
 ORIGINAL_COLOUR = ("original_red", "original_green", "original_blue")
 """Columns that `--displacement` adds beside these if `--colour` changed the colours."""
-UNCERTAINTY = "uncertainty"
-"""The column that `denoise --uncertainty` adds: standard deviation of what the point may still be off, in the file's unit."""
+UNCERTAINTY, OUTLIER = "uncertainty", "outlier"
+"""Columns that `denoise --uncertainty` and `--outliers flag` add, after those: standard deviation of what the point may still be
+off, in the file's unit; 1 for an outlier."""
+_AFTERWARDS = (UNCERTAINTY, OUTLIER)
 
 
 def undo(
@@ -79,31 +83,57 @@ def with_colours(before: Scan, after: Scan, *, undoable: bool, threads: int | No
 
 
 def with_uncertainty(after: Scan, std: NDArray[np.float64]) -> Scan:
-    """The moved scan with one more column. Raises ScanError if it has one of that name already, which would be lost."""
-    if UNCERTAINTY in after.attributes:
-        raise ScanError(f"{after.origin}: has a column {UNCERTAINTY} already; rename it, or leave out --uncertainty")
+    """The moved scan with one more column."""
     return after.with_attributes(**{UNCERTAINTY: std.astype("f4")})
 
 
-def restored(scan: Scan) -> Scan:
-    """The scan before it was moved, without the columns that cleaning added. Raises ScanError if its places are not there.
+def with_outliers(after: Scan, outlier: Mask) -> Scan:
+    """The moved scan with one more column."""
+    return after.with_attributes(**{OUTLIER: outlier.astype("u1")})
 
-    A text without a header does not keep names: there the last four columns are taken, or the four before the last (the
-    uncertainty), if they agree with the coordinates.
+
+def refuse_taken(scan: Scan, asked: Mapping[str, bool]) -> None:
+    """Raises ScanError where a column that an option adds is there already, and would be lost. asked: options that are on."""
+    columns = {
+        "--displacement": (*ORIGINAL, DISPLACEMENT),
+        "--colour with --displacement": ORIGINAL_COLOUR,
+        "--uncertainty": (UNCERTAINTY,),
+        "--outliers flag": (OUTLIER,),
+    }
+    for option, names in columns.items():
+        if asked.get(option) and (taken := [name for name in names if name in scan.attributes]):
+            raise ScanError(f"{scan.origin}: has a column {taken[0]} already; undo or rename it first, or leave out {option}")
+
+
+def restored(scan: Scan) -> Scan:
+    """The scan before it was moved, without the columns that cleaning added: the places and what follows them of ours.
+
+    A text without a header does not keep names: there the last four columns are taken, or four with one or two after them (the
+    uncertainty, the outliers), if they agree with the coordinates. Raises ScanError if places are not there.
     """
     import numpy as np
 
     from pcdenoise import io
 
-    names = [*ORIGINAL, DISPLACEMENT]
-    if set(names) <= set(scan.attributes) or (names := _last_columns(scan)):
-        before = np.stack([scan.attributes[name].astype(np.float64) for name in names[:3]], axis=1)
-        if set(ORIGINAL_COLOUR) <= set(scan.attributes):
-            colours = {name: scan.attributes[original] for name, original in zip(COLOUR, ORIGINAL_COLOUR, strict=True)}
-            scan = replace(scan, attributes={**scan.attributes, **colours})
-        added = [name for name in (*names, *ORIGINAL_COLOUR, UNCERTAINTY) if name in scan.attributes]
-        return io.without(scan, list(dict.fromkeys(added))).moved_to(before)
-    raise ScanError(f"{scan.origin}: no places before the move are stored; only what denoise --displacement wrote can be undone")
+    present = list(scan.attributes)
+    places = [*ORIGINAL, DISPLACEMENT]
+    if set(places) <= set(present):
+        after = present[present.index(DISPLACEMENT) + 1 :]
+        added = [name for name in present if name in (*places, *ORIGINAL_COLOUR)] + [
+            name for name in after if name in _AFTERWARDS
+        ]
+    else:
+        added = _last_columns(scan)
+        places = added[:4]
+    if not added:
+        raise ScanError(
+            f"{scan.origin}: no places before the move are stored; only what denoise --displacement wrote can be undone"
+        )
+    before = np.stack([scan.attributes[name].astype(np.float64) for name in places[:3]], axis=1)
+    if set(ORIGINAL_COLOUR) <= set(present):
+        colours = {name: scan.attributes[original] for name, original in zip(COLOUR, ORIGINAL_COLOUR, strict=True)}
+        scan = replace(scan, attributes={**scan.attributes, **colours})
+    return io.without(scan, added).moved_to(before)
 
 
 def _last_columns(scan: Scan) -> list[str]:
@@ -111,14 +141,13 @@ def _last_columns(scan: Scan) -> list[str]:
     names = list(scan.attributes)
     if scan.format != "xyz":
         return []
-    return next((last for last in (names[-4:], names[-5:]) if _is_displacement(scan, last[:4])), [])
+    lasts = (names[-n:] for n in range(4, 5 + len(_AFTERWARDS)) if n <= len(names))
+    return next((last for last in lasts if _is_displacement(scan, last[:4])), [])
 
 
 def _is_displacement(scan: Scan, names: list[str]) -> bool:
     import numpy as np
 
-    if len(names) < 4:
-        return False
     *before, displacement = (np.asarray(scan.attributes[name], dtype=np.float64) for name in names)
     length = np.linalg.norm(scan.points - np.stack(before, axis=1), axis=1)
     tolerance = 1e-3 * np.nanmax(displacement, initial=0.0)

@@ -106,8 +106,9 @@ def denoise(
         "points_left_alone": int(unmoved.sum()),
         "points_not_finite": int((~cloud.finite).sum()),
         "points_coincident": int(cloud.finite.sum()) - len(cloud.start),
-        "outliers": int(found.sum()),
     }
+    if config.outliers != "keep":
+        figures["outliers"] = int(found.sum())
     std = None
     if config.uncertainty:
         order = spatial_order(cloud.reached)

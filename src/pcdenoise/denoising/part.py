@@ -60,7 +60,7 @@ def denoise_part(
         "move_max": float(length.max(initial=0.0)),
         "points_left_alone": int(left_alone[movable].sum()),
         "points_not_finite": int((~usable[movable]).sum()),
-        "outliers": int(outlier.sum()),
+        **({"outliers": int(outlier.sum())} if "outliers" in result.figures else {}),
         "points_selected": int(movable.sum()),
         "points_seen": len(rows),
     }

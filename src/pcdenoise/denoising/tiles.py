@@ -263,7 +263,7 @@ class Tiles:
             "move_p99": float(np.quantile(some, 0.99)),
             "move_max": longest,
             "points_left_alone": n_unmoved,
-            "outliers": n_outliers,
+            **({"outliers": n_outliers} if self.config.outliers != "keep" else {}),
         }
 
     def level(self, number: int) -> NoiseLevel:
