@@ -15,6 +15,7 @@ from safetensors.torch import load_file
 from pcdenoise.config import TrainConfig
 from pcdenoise.learning import trainer
 from pcdenoise.learning.ranks import Ranks
+from pcdenoise.learning.run import CHECKPOINT
 from pcdenoise.networks import store
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -25,9 +26,10 @@ from pathlib import Path
 from safetensors.torch import save_file
 from pcdenoise.config import TrainConfig
 from pcdenoise.learning import dataset, ranks, trainer
+from pcdenoise.learning.run import Run
 
 folder, config = Path(sys.argv[1]), TrainConfig(**{SETTINGS!r})
-learn = trainer._Run.learn
+learn = Run.learn
 
 def noted(self, signal, cloud):
     learn(self, signal, cloud)
@@ -40,7 +42,7 @@ def interrupt(_task, share):
         raise KeyboardInterrupt
 
 def run():
-    trainer._Run.learn = noted
+    Run.learn = noted
     with ranks.joined() as both:
         trainer.train(config, folder / "whole")
         dataset.CloudsAhead.clouds = lambda self, first, neighbours, ahead=6, stride=1: (
@@ -107,7 +109,7 @@ def test_their_gradient_is_that_of_one_process_that_sees_both_clouds(trained: Pa
 
 def test_two_processes_go_on_where_they_were_interrupted_and_leave_one_model(trained: Path) -> None:
     assert (trained / "parts" / store.WEIGHTS).read_bytes() == (trained / "whole" / store.WEIGHTS).read_bytes()
-    assert not (trained / "parts" / trainer.CHECKPOINT).exists()
+    assert not (trained / "parts" / CHECKPOINT).exists()
     assert store.load(trained / "whole").config.training["steps_done"] == SETTINGS["steps"]
 
 

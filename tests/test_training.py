@@ -11,7 +11,7 @@ import torch
 
 from pcdenoise.config import TrainConfig
 from pcdenoise.errors import ModelError, UsageError
-from pcdenoise.learning import trainer
+from pcdenoise.learning import run, trainer
 from pcdenoise.learning.dataset import CloudSource, Surface, draw_cloud, from_surface
 from pcdenoise.learning.distill import cleaned
 from pcdenoise.learning.sources import noisy_from, surfaces_from
@@ -78,7 +78,7 @@ def test_an_interrupted_run_resumes_to_the_same_weights_as_an_undisturbed_one(tm
     summary = trainer.train(config, parts, resume=True)
     assert summary.steps == 4
     assert (whole / store.WEIGHTS).read_bytes() == (parts / store.WEIGHTS).read_bytes()
-    assert not (parts / trainer.CHECKPOINT).exists()
+    assert not (parts / run.CHECKPOINT).exists()
     assert json.loads((parts / store.CONFIG).read_text())["training"]["seed"] == config.seed
 
 
@@ -90,15 +90,15 @@ def test_a_run_is_resumed_with_its_own_settings_and_its_curve_is_its_own(tmp_pat
         if share >= 0.5:
             raise KeyboardInterrupt
 
-    (tmp_path / trainer.LOG).write_text('{"step": 1, "error": 99}\n')
+    (tmp_path / run.LOG).write_text('{"step": 1, "error": 99}\n')
     with pytest.raises(KeyboardInterrupt):
         trainer.train(TINY, tmp_path, on_progress=interrupt)
     with pytest.raises(UsageError, match="--seed 1"):
         trainer.train(TINY.model_copy(update={"seed": 9}), tmp_path, resume=True)
-    with (tmp_path / trainer.LOG).open("a") as log:
+    with (tmp_path / run.LOG).open("a") as log:
         log.write('{"step": 3, "error": 99}\n')  # learned after the last checkpoint, and lost with its process
     trainer.train(TINY.model_copy(update={"steps": 4}), tmp_path, resume=True)
-    curve = [json.loads(line) for line in (tmp_path / trainer.LOG).read_text().splitlines()]
+    curve = [json.loads(line) for line in (tmp_path / run.LOG).read_text().splitlines()]
     assert [line["step"] for line in curve] == [2, 4]
     assert all(line["error"] < 10 for line in curve)
 
@@ -110,18 +110,18 @@ def test_a_run_that_ends_before_it_learned_leaves_the_model_that_was_there(tmp_p
     def interrupt(*_given: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(trainer._Run, "learn", interrupt)
+    monkeypatch.setattr(run.Run, "learn", interrupt)
     with pytest.raises(KeyboardInterrupt):
         trainer.train(TINY.model_copy(update={"seed": 5}), tmp_path)
     assert (tmp_path / store.WEIGHTS).read_bytes() == before
-    assert not (tmp_path / trainer.CHECKPOINT).exists()
+    assert not (tmp_path / run.CHECKPOINT).exists()
 
 
 def test_there_must_be_something_to_resume_and_it_must_be_a_checkpoint(tmp_path):
     resume = partial(trainer.train, TrainConfig(steps=1, channels=4, rounds=(1,), data=("shapes:1",)), resume=True)
     with pytest.raises(UsageError, match="nothing to resume"):
         resume(tmp_path)
-    (tmp_path / trainer.CHECKPOINT).write_bytes(b"\x08" + bytes(30))
+    (tmp_path / run.CHECKPOINT).write_bytes(b"\x08" + bytes(30))
     with pytest.raises(ModelError, match="not a checkpoint"):
         resume(tmp_path)
 

@@ -29,6 +29,7 @@ from pcdenoise.config import DenoiseConfig, TrainConfig
 from pcdenoise.denoising.denoiser import denoise
 from pcdenoise.learning import trainer
 from pcdenoise.learning.dataset import Surface
+from pcdenoise.learning.run import Run
 from pcdenoise.learning.supervised import NearestSurface
 from pcdenoise.networks import store
 from pcdenoise.synthesis.lidar import scan_mesh
@@ -83,17 +84,17 @@ def trial(case: Case, folder: Path, budget_s: float | None, steps: int | None) -
     about |= {"shipped": case.rms(guessed.points), "told": case.rms(told.points)}
     if steps == 0:
         return {**about, "steps": 0, "adapted": math.nan, "learned": math.nan, "verdict": "nothing was learned"}
-    judge = trainer._Run.judge
+    judge = Run.judge
 
-    def remembering(run: trainer._Run, *given: Any) -> None:
+    def remembering(run: Run, *given: Any) -> None:
         store.save(run.average, folder / "learned", summary="", training={}, scores={}, card="")
         judge(run, *given)
 
-    trainer._Run.judge = remembering  # type: ignore[method-assign]
+    Run.judge = remembering  # type: ignore[method-assign]
     try:
         summary = trainer.train(TrainConfig(data=(str(scan),), budget_s=budget_s, steps=steps, threads=1), output)
     finally:
-        trainer._Run.judge = judge  # type: ignore[method-assign]
+        Run.judge = judge  # type: ignore[method-assign]
     adapted, learned = (case.rms(denoise(case.noisy, store.load(place), config).points) for place in (output, folder / "learned"))
     about |= {"steps": summary.steps, "seconds": round(summary.seconds, 1)}
     return {**about, "adapted": adapted, "learned": learned, "verdict": summary.verdict}

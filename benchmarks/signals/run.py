@@ -23,6 +23,7 @@ from pcdenoise.config import DenoiseConfig, TrainConfig
 from pcdenoise.denoising.denoiser import denoise
 from pcdenoise.learning import trainer
 from pcdenoise.learning.dataset import Surface
+from pcdenoise.learning.run import TrainingSummary
 from pcdenoise.learning.supervised import NearestSurface
 from pcdenoise.networks import store
 from pcdenoise.networks.projection import ProjectionConfig, ProjectionNetwork
@@ -57,7 +58,7 @@ def scores(model: store.Model, shapes: list[tuple[NearestSurface, np.ndarray]]) 
     return found
 
 
-def learned(signal: str, data: str, n_shapes: int, steps: int, folder: Path) -> trainer.TrainingSummary:
+def learned(signal: str, data: str, n_shapes: int, steps: int, folder: Path) -> TrainingSummary:
     """One training run from nothing into a model folder."""
     own: dict[str, Any] = {"method": "supervised" if signal == "surfaces" else signal}
     own |= {"data": (f"shapes:{n_shapes}",)} if signal == "surfaces" else {"data": (data,), "pairs": signal == "supervised"}

@@ -90,7 +90,7 @@ def train(
     Example: pcdenoise train -o my_model --budget 20m
     """
     from pcdenoise.config import TrainConfig
-    from pcdenoise.learning import ranks, trainer
+    from pcdenoise.learning import ranks, run, trainer
 
     settings = configured(
         TrainConfig, data=data, method=method, network=network, pairs=pairs, neighbours=neighbours, learning_rate=learning_rate,
@@ -101,7 +101,7 @@ def train(
     refuse_existing([report], overwrite)
     console = Console(quiet or not ranks.is_first())
     if overwrite and not resume and ranks.is_first():
-        trainer.discard(output)
+        run.discard(output)
     with console.progress("train") as on_progress:
         summary = trainer.train(settings, output, init=init, resume=resume, on_progress=on_progress)
     if report and ranks.is_first():
@@ -113,7 +113,7 @@ def _save_report(path: Path, output: Path, figures: dict[str, Any], overwrite: b
     """Figures of a run and settings as it settled them, as HTML with its curve."""
     from pcdenoise.evaluation.charts import curve
     from pcdenoise.evaluation.report import Page
-    from pcdenoise.learning.trainer import LOG
+    from pcdenoise.learning.run import LOG
     from pcdenoise.networks import store
 
     model = store.load(output)

@@ -46,7 +46,7 @@ def split_loss(network: ProjectionNetwork, cloud: TrainingCloud) -> tuple[Tensor
     return loss + robust(error), error.square().mean()
 
 
-def judge(network: ProjectionNetwork, cloud: TrainingCloud) -> float:
+def held_out_error(network: ProjectionNetwork, cloud: TrainingCloud) -> float:
     """The error of `split_loss` on a cloud, for comparing weights without truth; NaN where too little is held out."""
     with torch.no_grad():
         return float(split_loss(network, cloud)[1])
