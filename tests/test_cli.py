@@ -324,6 +324,49 @@ def test_pairs_give_a_foreign_trainer_noisy_and_pseudo_clean_rows(sphere: Path) 
     assert main(["pairs", str(sphere), "-o", str(out), "--prior", "full", "--overwrite", "-q"]) == 2
 
 
+@pytest.mark.parametrize(
+    ("command", "names"),
+    [
+        (["iterate", "--iters", "1", *FAST], ["passes.png", "report.html", "stdin_1.xyz"]),
+        (["iterate", "--iters", "1", "--format", "xyz", *FAST], ["passes.png", "report.html", "stdin_1.xyz"]),
+        (["split", "--points", "1500"], ["stdin_0001.xyz", "stdin_0002.xyz"]),
+        (["pairs", "--draws", "1"], ["stdin_0001.npz"]),
+    ],
+)
+def test_what_comes_from_stdin_is_named_so_with_a_suffix(command: list[str], names: list[str], sphere: Path, run: Run) -> None:
+    out = sphere.with_name("out")
+    done = run(command[0], "-", "-o", out, *command[1:], input=sphere.read_bytes())
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in out.iterdir()) == names
+    assert b" 1 pairs" not in done.stderr
+    assert b" 1 passes" not in done.stderr
+
+
+@pytest.mark.parametrize("command", [["split", "--points", "1500"], ["pairs", "--draws", "1"]])
+def test_split_and_pairs_go_on_past_a_broken_input(
+    command: list[str], sphere: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(sphere.parent)
+    Path("broken.ply").write_bytes(b"ply\nformat nonsense\n")
+    assert main([command[0], "broken.ply", "-o", "none", *command[1:]]) == 3
+    assert not Path("none").exists()
+    capsys.readouterr()
+    assert main([command[0], "broken.ply", "sphere.xyz", "-o", "out", *command[1:], "-q"]) == 1
+    assert capsys.readouterr().err.splitlines()[-1] == "pcdenoise: 1 of 2 inputs failed; the others are done"
+    assert any(path.name.startswith("sphere_0001") for path in Path("out").iterdir())
+
+
+@pytest.mark.parametrize("command", [["iterate"], ["split"], ["pairs"], ["synth"], ["train", "--steps", "1"]])
+def test_a_file_in_the_place_of_a_folder_is_told(
+    command: list[str], sphere: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(sphere.parent)
+    Path("afile").touch()
+    source = {"synth": ["shapes:1"], "train": []}.get(command[0], ["sphere.xyz"])
+    assert main([command[0], *source, "-o", "afile", *command[1:]]) in (3, 4)
+    assert "afile: is a file where a folder is needed" in the_one_line(capsys.readouterr().err)
+
+
 def test_what_tune_writes_denoise_reads(tmp_path: Path, rng: np.random.Generator) -> None:
     from pcdenoise import io
     from pcdenoise.cloud.scan import Scan

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from pcdenoise import __version__
 from pcdenoise.commands import outputs, selection
 from pcdenoise.commands.batch import Figures
-from pcdenoise.commands.console import Console, figure
+from pcdenoise.commands.console import Console, counted, figure
 from pcdenoise.commands.files import STREAM, Job, format_of
 from pcdenoise.commands.undo import with_colours, with_displacement, with_uncertainty
 from pcdenoise.commands.verify import check_drift
@@ -48,6 +48,12 @@ def refuse_model(name: str | None, settings: DenoiseConfig) -> None:
     """Raises UsageError where a model is named that no one would use."""
     if settings.method != "network" and name is not None:
         raise UsageError(f"--model {name}: --method {settings.method} uses no model; leave one of the two out")
+
+
+def settings_of(config: DenoiseConfig, model: Model | None) -> dict[str, Any]:
+    """A configuration with the model that it was used with, by name and SHA-256, for reports and provenance."""
+    named = {"model": model.name, "model_sha256": model.sha256} if model else {}
+    return {**config.model_dump(mode="json"), **named}
 
 
 def cells_of(job: Job) -> Path:
@@ -96,9 +102,8 @@ class Cleaning:
     @property
     def settings(self) -> dict[str, Any]:
         """Everything that shaped the result, by name, for the report and the file's provenance."""
-        named = {"model": self.model.name, "model_sha256": self.model.sha256} if self.model else {}
         colour = {"colour": True} if self.colour else {}
-        return {**self.config.model_dump(mode="json"), **self.selection.settings, **named, **colour}
+        return {**settings_of(self.config, self.model), **self.selection.settings, **colour}
 
     def clean(self, job: Job) -> Figures:
         """Reads one scan, cleans it, writes it with its picture, and returns its figures; in cells on disk if it is too large."""
@@ -234,7 +239,7 @@ def picture_notes(result: Result, unit: str) -> tuple[str, str]:
 
 def _summary(figures: Figures) -> str:
     """One line for a person: how many points, how noisy they were, how far they moved, what was left alone."""
-    parts = [f"{figures['points']:,} points"]
+    parts = [counted(figures["points"], "point")]
     if "points_selected" in figures:
         parts.append(f"{figures['points_selected']:,} selected")
     parts.append(f"noise {figure(figures['noise'])}" if figures["is_surface"] else "no surface to clean")
@@ -242,5 +247,5 @@ def _summary(figures: Figures) -> str:
     if figures["points_left_alone"]:
         parts.append(f"{figures['points_left_alone']:,} left alone")
     if figures["outliers"]:
-        parts.append(f"{figures['outliers']:,} outliers")
+        parts.append(counted(figures["outliers"], "outlier"))
     return ", ".join([*parts, f"{figures['seconds']:.1f} s"])

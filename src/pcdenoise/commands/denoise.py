@@ -135,7 +135,7 @@ def denoise(
         settings = settings.model_copy(update={"threads": settings.threads or n_threads})
     jobs = plan(sources, output, suffix=suffix, format=format, share=share)
     files.refuse_unknown([job.target for job in jobs], format)
-    drawn = plan(sources, str(picture), format="png", share=share) if picture else []
+    drawn = plan(sources, str(picture), format="png", share=share, option="--picture") if picture else []
     if is_far and any(STREAM in (job.source, job.target) for job in jobs):
         raise UsageError("-: workers have neither standard input nor output; name files, or leave --workers and --engine out")
     if engine == "dask":

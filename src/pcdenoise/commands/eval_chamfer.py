@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pcdenoise.commands import options, outputs
 from pcdenoise.commands.batch import Batch, Figures
 from pcdenoise.commands.console import Console, figure, table
-from pcdenoise.commands.files import STREAM, Job, expand, format_of, plan, refuse_existing
+from pcdenoise.commands.files import STREAM, Job, beside, expand, format_of, refuse_existing
 from pcdenoise.commands.options import option
 from pcdenoise.errors import UsageError
 
@@ -47,8 +47,8 @@ def eval_chamfer(
     if clean is None and mesh is None:
         raise UsageError("there is no truth to compare with; give --clean FILE, --mesh FILE or both")
     sources = expand(inputs)
-    coloured = {job.source: job.target for job in plan(sources, error_ply, suffix="_error", format="ply")} if error_ply else {}
-    pictures = {job.source: job.target for job in plan(sources, picture, suffix="_error", format="png")} if picture else {}
+    coloured = beside(sources, error_ply, "--error-ply", format="ply", suffix="_error")
+    pictures = beside(sources, picture, "--picture", format="png", suffix="_error")
     refuse_existing([*coloured.values(), *pictures.values(), report], overwrite)
     truth = io.read(clean, format=format_of(clean, format)) if clean else None
     clean_points = truth.points[truth.finite] if truth else None

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pcdenoise.commands import options
 from pcdenoise.commands.batch import Batch, Figures
 from pcdenoise.commands.console import Console, facts, figure
-from pcdenoise.commands.files import Job, expand, format_of, plan, refuse_existing
+from pcdenoise.commands.files import Job, beside, expand, format_of, refuse_existing, target_name
 from pcdenoise.commands.options import option
 from pcdenoise.commands.survey import cost_text, survey
 
@@ -50,8 +50,8 @@ def info(
 
     batch = Batch(Console())
     sources = expand(inputs)
-    pictures = {job.source: job.target for job in plan(sources, picture, suffix="_noise", format="png")} if picture else {}
-    maps = {job.source: job.target for job in plan(sources, noise_map, suffix="_noise")} if noise_map else {}
+    pictures = beside(sources, picture, "--picture", format="png", suffix="_noise")
+    maps = beside(sources, noise_map, "--noise-map", suffix="_noise")
     refuse_existing([*pictures.values(), *maps.values()], overwrite)
 
     def describe(job: Job) -> Figures:
@@ -155,4 +155,4 @@ def _noise(found: dict[str, Any]) -> str:
 def _suggestion(path: Path, found: dict[str, Any]) -> str:
     if not found.get("is_surface"):
         return "nothing to clean: denoise would leave these points where they are"
-    return f"pcdenoise denoise {shlex.quote(str(path))} -o {shlex.quote(f'{path.stem}_clean{path.suffix}')}"
+    return f"pcdenoise denoise {shlex.quote(str(path))} -o {shlex.quote(target_name(path, '_clean', found=found['format']))}"
