@@ -176,18 +176,8 @@ def coordinate_system(scan: Scan) -> Crs | None:
 
 
 def coordinate_step(scan: Scan) -> float | None:
-    """The step between coordinates that the file can hold: the scale of a LAS, the decimals of a text; None if there is none.
-
-    Apart from LAS it is told from up to 10 000 rows: the largest power of ten, 1 to 1e-8, that all coordinates are multiples of.
-    """
-    if isinstance(scan.source, las.LasSource):
-        return float(np.abs(scan.source.file.field("scale")).max())
-    some = scan.points[scan.finite][:: max(1, len(scan) // 10_000)]
-    for decimals in range(9) if len(some) else ():
-        scaled = some * 10.0**decimals
-        if (np.abs(scaled - np.rint(scaled)) <= 1e-6 + 8 * np.finfo(np.float64).eps * np.abs(scaled)).all():
-            return float(10.0**-decimals)
-    return None
+    """The step that the file rounds moved coordinates to: the scale of a LAS; None for all others, whose numbers have room."""
+    return float(np.abs(scan.source.file.field("scale")).max()) if isinstance(scan.source, las.LasSource) else None
 
 
 def without(scan: Scan, names: Collection[str]) -> Scan:
