@@ -180,6 +180,42 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(sphere: Path, capsys: pyte
     assert not out.exists()
 
 
+@pytest.mark.parametrize(
+    ("options", "code", "words"),
+    [
+        (["-o", "there.xyz"], 3, "there.xyz: the file exists"),
+        (["-o", "c.xyz", "--model", "nope"], 4, "nope: no such model"),
+        (["-o", "c.xyz", "--only-class", "2"], 3, "has no classes"),
+        (["-o", "c.abc"], 3, "c.abc: no suffix tells its format"),
+        (["-o", "c.bin", "--method", "mean"], 3, "would drop"),
+        (["-o", "c.xyz", "--tile", "1000", "--outliers", "remove"], 2, "use --outliers flag, or leave out --tile"),
+    ],
+)
+def test_a_dry_run_refuses_what_the_run_refuses(
+    options: list[str], code: int, words: str, sphere: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(sphere.parent)
+    Path("there.xyz").touch()
+    for command in (["denoise", "sphere.xyz", *options, "--dry-run"], ["denoise", "sphere.xyz", *options]):
+        assert main(command) == code
+        assert words in the_one_line(capsys.readouterr().err)
+    assert sorted(path.name for path in Path().iterdir()) == ["sphere.xyz", "there.xyz"]
+
+
+def test_a_plan_goes_on_past_a_broken_input(
+    sphere: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(sphere.parent)
+    Path("broken.ply").write_bytes(b"ply\nformat nonsense\n")
+    assert main(["denoise", "broken.ply", "sphere.xyz", "-o", "out/", "--dry-run", *FAST]) == 1
+    rows = capsys.readouterr().out.splitlines()
+    assert rows[2].startswith("broken.ply")
+    assert "no end_header" in rows[2]
+    assert rows[3].startswith("sphere.xyz")
+    assert rows[3].endswith("ready")
+    assert not Path("out").exists()
+
+
 def strength_used(sphere: Path, *arguments: str) -> float:
     report = sphere.with_name("report.json")
     code = main(

@@ -51,7 +51,9 @@ def read(path: str | os.PathLike[str], *, format: str | None = None) -> Scan:
     found = _sniffed(raw[:_HEAD])
     if named != "bin" and not (found and _MODULES[named or found] is _MODULES[found]):
         content = {"xyz": "text", "": "of no known format"}.get(found, found)
-        raise ScanError(f"{origin}: is taken for {named or 'a scan'} but its content is {content}; rename it or name its format")
+        raise ScanError(
+            f"{origin}: is taken for {named or 'a scan'} but its content is {content}; rename it or name its format (--format)"
+        )
     scan: Scan = _MODULES[named or found].read(raw, origin)
     return scan
 
@@ -73,18 +75,24 @@ def write(
     """
     target = os.fspath(path)
     if format is None and target == files.STREAM:
-        raise ScanError("stdout: has no suffix to tell the format by; name the format")
+        raise ScanError("stdout: has no suffix to tell the format by; name the format (--format)")
     named = _known(format or _by_suffix(path))
     if target.lower().endswith(".copc.laz"):
         raise ScanError(f"{target}: rows stay in order, so no COPC octree is written; name the file .laz without .copc")
-    lost = losses(scan, named)
-    if lost and not drop_attributes:
-        raise ScanError(f"{target}: {named} would drop {', '.join(lost)}; allow dropping attributes or write .{scan.format}")
+    if not drop_attributes:
+        refuse_losses(scan, path, named)
     with files.written(path, overwrite=overwrite) as file:
         try:
             _encode(scan, file, named, Path(target).suffix.lower(), provenance)
         except ScanError as fault:
             raise ScanError(f"{target}: {fault}") from None
+
+
+def refuse_losses(scan: Scan, path: str | os.PathLike[str], format: str) -> None:
+    """Raises ScanError if writing the scan in a format would drop something."""
+    if lost := losses(scan, format):
+        fix = f"allow dropping attributes (--drop-attributes) or write .{scan.format}"
+        raise ScanError(f"{os.fspath(path)}: {format} would drop {', '.join(lost)}; {fix}")
 
 
 class Stream(Protocol):
@@ -222,9 +230,8 @@ def _known(format: str) -> str:
 def _by_suffix(path: str | os.PathLike[str]) -> str:
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
-        raise ScanError(
-            f"{os.fspath(path)}: no suffix tells its format; name the format, or use one of {' '.join(sorted(SUFFIXES))}"
-        )
+        fix = f"name the format (--format), or use one of {' '.join(sorted(SUFFIXES))}"
+        raise ScanError(f"{os.fspath(path)}: no suffix tells its format; {fix}")
     return SUFFIXES[suffix]
 
 
