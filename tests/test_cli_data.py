@@ -116,6 +116,16 @@ def test_eval_chamfer_is_zero_for_the_truth_itself_and_needs_one(data: Path, cap
     assert "--clean" in capsys.readouterr().err
 
 
+def test_eval_chamfer_names_the_file_that_is_empty(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    clean, empty = str(data / "shape_0000_clean.ply"), data / "empty.ply"
+    pcdenoise.write(pcdenoise.Scan(np.zeros((0, 3))), empty)
+    for result, truth in ((str(empty), clean), (clean, str(empty))):
+        assert main(["eval-chamfer", result, "--clean", truth]) == 3
+        captured = capsys.readouterr()
+        assert captured.err.startswith(f"pcdenoise: {empty}: has 0 points with coordinates")
+        assert captured.out == ""
+
+
 def test_iterate_writes_every_pass_a_table_a_strip_and_a_page(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = data / "steps"
     noisy, clean = data / "shape_0000_gaussian_1.ply", data / "shape_0000_clean.ply"
@@ -161,7 +171,10 @@ def test_models_lists_the_default_model_and_prints_its_card(capsys: pytest.Captu
     assert json.loads(capsys.readouterr().out)[0]["n_parameters"] > 1000
     assert main(["models", "default"]) == 0
     assert len(capsys.readouterr().out) > 500
+    assert main(["models", "default", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["name"] == "default"
     assert main(["models", "no-such-model"]) == 4
+    assert "no such model; give" in capsys.readouterr().err
 
 
 def test_a_model_trained_for_two_steps_can_be_used_and_listed(data: Path, capsys: pytest.CaptureFixture[str]) -> None:

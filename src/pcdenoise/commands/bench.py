@@ -73,11 +73,13 @@ def bench(
             for place, (name, smoother) in enumerate(methods):
                 on_progress(name, place / len(methods))
                 rows += [{"method": name, **trial.run(smoother, share, seed)} for share in times]
-        print(_as_text(job.source, _by_method(rows), times, trial), end="\n\n" if len(jobs) > 1 else "\n")
-        return {"rows": rows}
+        return {"points": len(trial.given), "noise": trial.level.std, "rows": rows}
+
+    def show(job: Job, found: Figures) -> None:
+        print(_as_text(job.source, found, times), end="\n\n" if len(jobs) > 1 else "\n")
 
     batch = Batch(console)
-    batch.run(jobs, compare)
+    batch.run(jobs, compare, show=show)
     if report:
         settings = {
             "models": list(models),
@@ -226,8 +228,9 @@ def _by_row(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return found
 
 
-def _as_text(source: Path, rows: list[dict[str, Any]], times: list[float], trial: _Trial) -> str:
+def _as_text(source: Path, found: Figures, times: list[float]) -> str:
     """The rows of `_by_method` for a person, the best error of each noise marked."""
+    rows = _by_method(found["rows"])
     names = [_error_at(share) for share in times]
     best = {name: min(row[name] for row in rows) for name in names}
     lines = [
@@ -239,7 +242,7 @@ def _as_text(source: Path, rows: list[dict[str, Any]], times: list[float], trial
         ]
         for row in rows
     ]
-    head = f"{source}: {len(trial.given):,} points cleaned, as many held back; noise {figure(trial.level.std)}"
+    head = f"{source}: {found['points']:,} points cleaned, as many held back; noise {figure(found['noise'])}"
     headers = ["method", *(f"{name}  " for name in names), "CPU s", "evenness"]
     foot = (
         "error: distance from the surface, lower is better, * best; evenness: std / mean of spacing, lower is more even; "

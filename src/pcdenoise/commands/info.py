@@ -57,8 +57,6 @@ def info(
     def describe(job: Job) -> Figures:
         scan = io.read(job.source, format=format_of(job.source, format))
         found = survey(scan, seed=seed, threads=threads or -1)
-        if not as_json:
-            print(_as_text(job.source, found), end="\n\n" if len(jobs) > 1 else "\n")
         if job.source in {**pictures, **maps}:
             noise = _noise_of_rows(scan, seed, threads or -1)
             if target := pictures.get(job.source):
@@ -69,8 +67,11 @@ def info(
                 io.write(marked, target, format=format_of(target, format), overwrite=overwrite)
         return found
 
+    def show(job: Job, found: Figures) -> None:
+        print(_as_text(job.source, found), end="\n\n" if len(jobs) > 1 else "\n")
+
     jobs = [Job(source, source) for source in sources]
-    batch.run(jobs, describe)
+    batch.run(jobs, describe, show=None if as_json else show)
     if as_json:
         done = [{"input": record["input"], **record["figures"]} for record in batch.records if record["status"] == "done"]
         print(json.dumps(done, indent=2))

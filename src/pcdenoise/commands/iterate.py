@@ -10,6 +10,7 @@ from pcdenoise.commands import options, outputs
 from pcdenoise.commands.cleaning import chosen_model, settings_of
 from pcdenoise.commands.console import Console, counted, figure, table
 from pcdenoise.commands.denoise import Iters, Method, Neighbours, Noise, Radius, SigmaD, SigmaN, Unshrink
+from pcdenoise.commands.eval_chamfer import points_to_compare
 from pcdenoise.commands.files import format_of, refuse_existing, refuse_file, target_name
 from pcdenoise.commands.options import argument, configured, option
 
@@ -63,7 +64,7 @@ def iterate(
         return output / target_name(source, f"_{number}", format, scan.format)
 
     refuse_existing([] if settings.iters == "auto" else [target(1 + number) for number in range(settings.iters)], overwrite)
-    truth = _Truth(_finite(io.read(clean)) if clean else None, load_mesh(mesh) if mesh else None)
+    truth = _Truth(points_to_compare(clean, format) if clean else None, load_mesh(mesh) if mesh else None)
     weights = chosen_model(model, settings)
     named = settings_of(settings, weights)
     passes = [_Pass(scan.points, truth.errors(scan.points))]

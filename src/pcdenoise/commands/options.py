@@ -98,7 +98,7 @@ def configured(model: type[ConfigModel], **values: Any) -> ConfigModel:
         return model(**values)
     except ValidationError as error:
         first = error.errors()[0]
-        name = _flag(str(first["loc"][0])) if first["loc"] else "options"
+        name = _flag(str(first["loc"][0]).removesuffix("_s")) if first["loc"] else "options"  # of budget_s, which is --budget
         message = first["msg"].removeprefix("Value error, ")
         message = f"{message[0].lower()}{message[1:]}".replace("input should be", "must be")
         raise UsageError(f"{name}: {message}, got {first['input']!r}") from None

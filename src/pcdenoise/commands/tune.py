@@ -9,7 +9,7 @@ from pcdenoise.commands import options
 from pcdenoise.commands.console import Console
 from pcdenoise.commands.files import refuse_existing
 from pcdenoise.commands.options import argument, option
-from pcdenoise.errors import UsageError
+from pcdenoise.errors import ScanError, UsageError
 
 
 def tune(
@@ -34,6 +34,9 @@ def tune(
     from pcdenoise.learning.scans import noisy_and_clean
 
     refuse_existing([output], overwrite)
+    for path in data:
+        if not path.exists():
+            raise ScanError(f"{path}: no such file or folder; check the path")
     pairs = list(noisy_and_clean(data))
     if not pairs:
         raise UsageError(f"{', '.join(map(str, data))}: no noisy cloud with a clean one; give folders made by pcdenoise synth")
