@@ -37,7 +37,7 @@ def bench(
         str, option("--added", metavar="TIMES,...", help="Noise added on top, in multiples of the scan's own.")
     ] = "0,1,2",
     points: Annotated[int, option("--points", min=FEWEST_POINTS, help="Of a larger scan, a compact part of so many.")] = 40_000,
-    format: options.Format = None,
+    format: options.FormatRead = None,
     report: options.Report = None,
     overwrite: options.Overwrite = False,
     config: options.Config = None,

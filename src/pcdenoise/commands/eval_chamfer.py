@@ -28,7 +28,7 @@ def eval_chamfer(
         option("--error-ply", metavar="OUT", help="Write errors as a coloured PLY: a file, or a folder for several."),
     ] = "",
     picture: Annotated[str, option("--picture", metavar="OUT", help="Write the histogram of errors as PNG, likewise.")] = "",
-    format: options.Format = None,
+    format: options.FormatRead = None,
     report: options.Report = None,
     overwrite: options.Overwrite = False,
     config: options.Config = None,

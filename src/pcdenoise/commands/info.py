@@ -35,7 +35,7 @@ def info(
     noise_map: Annotated[
         str, option("--noise-map", metavar="OUT", help="Write the scan with a column noise: a file, or a folder for several.")
     ] = "",
-    format: options.Format = None,
+    format: options.FormatRead = None,
     as_json: options.Json = False,
     overwrite: options.Overwrite = False,
     config: options.Config = None,

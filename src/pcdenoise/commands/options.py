@@ -127,10 +127,12 @@ Config = Annotated[
     Path | None,
     common("--config", is_eager=True, callback=_apply_config, metavar="FILE", help="TOML file with values for any options."),
 ]
-Format = Annotated[
-    Literal["las", "laz", "ply", "xyz", "pcd", "bin"] | None,
-    option("--format", help="Format of - and of files without a known suffix; into a folder: convert to it."),
-]
+OneOutput = Annotated[str, option("--output", "-o", metavar="OUT", help="A file, or - for stdout.")]
+_Formats = Literal["las", "laz", "ply", "xyz", "pcd", "bin"]
+_OF_NAMELESS = "Format of - and of files without a known suffix"
+Format = Annotated[_Formats | None, option("--format", help=f"{_OF_NAMELESS}; into a folder: convert to it.")]
+FormatRead = Annotated[_Formats | None, option("--format", help=f"{_OF_NAMELESS}.")]
+"""For commands that write no scan, or one file."""
 Model = Annotated[
     str | None, option("--model", metavar="NAME|DIR", help="A shipped model (see pcdenoise models) or a model folder.")
 ]

@@ -26,7 +26,7 @@ def pairs(
     to: Annotated[
         Literal["npz", "ply", "xyz"], option("--to", help="npz: arrays noisy and clean in one file; else a file for each cloud.")
     ] = "npz",
-    format: options.Format = None,
+    format: options.FormatRead = None,
     overwrite: options.Overwrite = False,
     config: options.Config = None,
     seed: options.Seed = 0,
