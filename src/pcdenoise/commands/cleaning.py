@@ -50,10 +50,9 @@ def refuse_model(name: str | None, settings: DenoiseConfig) -> None:
         raise UsageError(f"--model {name}: --method {settings.method} uses no model; leave one of the two out")
 
 
-def settings_of(config: DenoiseConfig, model: Model | None) -> dict[str, Any]:
-    """A configuration with the model that it was used with, by name and SHA-256, for reports and provenance."""
-    named = {"model": model.name, "model_sha256": model.sha256} if model else {}
-    return {**config.model_dump(mode="json"), **named}
+def named_model(model: Model | None) -> dict[str, str]:
+    """A model as reports and provenance name it; nothing for a classical filter."""
+    return {"model": model.name, "model_sha256": model.sha256} if model else {}
 
 
 def cells_of(job: Job) -> Path:
@@ -102,8 +101,9 @@ class Cleaning:
     @property
     def settings(self) -> dict[str, Any]:
         """Everything that shaped the result, by name, for the report and the file's provenance."""
+        named = named_model(self.model)
         colour = {"colour": True} if self.colour else {}
-        return {**settings_of(self.config, self.model), **self.selection.settings, **colour}
+        return {**self.config.model_dump(mode="json"), **self.selection.settings, **named, **colour}
 
     def clean(self, job: Job) -> Figures:
         """Reads one scan, cleans it, writes it with its picture, and returns its figures; in cells on disk if it is too large."""
@@ -274,5 +274,5 @@ def _summary(figures: Figures) -> str:
     if figures["points_left_alone"]:
         parts.append(f"{figures['points_left_alone']:,} left alone")
     if figures["outliers"]:
-        parts.append(counted(figures["outliers"], "outlier"))
+        parts.append(f"{figures['outliers']:,} outliers")
     return ", ".join([*parts, f"{figures['seconds']:.1f} s"])

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pcdenoise.commands import options, outputs
-from pcdenoise.commands.cleaning import chosen_model, settings_of
+from pcdenoise.commands.cleaning import chosen_model, named_model
 from pcdenoise.commands.console import Console, counted, figure, table
 from pcdenoise.commands.denoise import Iters, Method, Neighbours, Noise, Radius, SigmaD, SigmaN, Unshrink
 from pcdenoise.commands.eval_chamfer import points_to_compare
@@ -66,7 +66,7 @@ def iterate(
     refuse_existing([] if settings.iters == "auto" else [target(1 + number) for number in range(settings.iters)], overwrite)
     truth = _Truth(points_to_compare(clean, format) if clean else None, load_mesh(mesh) if mesh else None)
     weights = chosen_model(model, settings)
-    named = settings_of(settings, weights)
+    named = {**settings.model_dump(mode="json"), **named_model(weights)}
     passes = [_Pass(scan.points, truth.errors(scan.points))]
     with Console(quiet).progress(source.name) as on_progress:
         for number, step in enumerate(denoiser.iterate(scan.points, weights, settings), start=1):
