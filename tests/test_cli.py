@@ -256,7 +256,9 @@ def test_a_flag_beats_the_environment_beats_the_file_beats_the_default(sphere: P
         ("[denose]\nstrength = 0.5\n", "denose"),
         ("hue = 1\n", "--hue"),
         ("strength = \n", "TOML"),
-        ("[denoise]\nstrength = 'half'\n", "strength"),
+        ("[denoise]\nstrength = 'half'\n", "settings.toml: invalid value for '--strength'"),
+        ("[denoise]\nstrength = 1.5\n", "settings.toml: --strength: must be"),
+        ("[denoise]\nonly-class = [2, -6]\n", "settings.toml: --only-class 2,-6: give"),
     ],
 )
 def test_a_wrong_key_or_value_in_the_config_file_is_refused(
@@ -266,6 +268,22 @@ def test_a_wrong_key_or_value_in_the_config_file_is_refused(
     settings.write_text(text)
     assert main(["denoise", str(sphere), "-o", str(sphere.with_name("c.xyz")), "--config", str(settings), *FAST]) == 2
     assert words in the_one_line(capsys.readouterr().err)
+
+
+def test_a_list_in_the_config_file_is_joined_or_given_item_by_item(
+    sphere: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(sphere.parent)
+    Path("s.toml").write_text(
+        '[denoise]\nroi = [-2, -2, 2, 2.5]\ninputs = "sphere.xyz"\n[synth]\nlevels = [0.5, 1]\n[bench]\nadded = [0, 1.5]\n'
+        'model = "default"\n'
+    )
+    assert main(["denoise", "-o", "c.ply", "--config", "s.toml", "--report", "r.json", "-q", *FAST]) == 0
+    assert json.loads(Path("r.json").read_text())["settings"]["roi"][:4] == [-2, -2, None, 2]
+    assert main(["synth", "shapes:1", "-o", "data", "--points", "50", "--config", "s.toml", "-q"]) == 0
+    assert json.loads(Path("data/dataset.json").read_text())["levels_percent_of_diagonal"] == [0.5, 1]
+    assert main(["bench", "sphere.xyz", "--config", "s.toml", "--points", "1000", "-q"]) == 0
+    assert "error +1.5x" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

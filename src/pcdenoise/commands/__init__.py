@@ -72,7 +72,8 @@ def _import_into(group: typer.Typer, name: str) -> None:
     settings = {**_HELP, "auto_envvar_prefix": options.ENVIRONMENT_PREFIX}
     command = getattr(import_module(f"{__name__}.{word}"), word)
     said = paragraphs(command.__doc__)
-    group.command(name, help=said, context_settings=settings, no_args_is_help=name != "models")(command)
+    add = group.command(name, cls=options.Command, help=said, context_settings=settings, no_args_is_help=name != "models")
+    add(command)
 
 
 def _not_imported() -> None:

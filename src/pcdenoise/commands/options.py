@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
+from typer.core import TyperCommand
 from typer.main import get_command
 
 from pcdenoise.errors import UsageError
@@ -26,6 +28,35 @@ _LARGEST_CONFIG = 1 << 20
 option = partial(typer.Option, show_envvar=False)
 common = partial(option, rich_help_panel="Common")
 argument = partial(typer.Argument, show_envvar=False)
+
+
+class Command(TyperCommand):
+    """A command that names the config file where a value that it refuses came from there."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """As Typer does. Raises UsageError for a value of the config file that is not of its option's type."""
+        try:
+            return super().parse_args(ctx, args)
+        except typer.BadParameter as fault:
+            if fault.param is None or not _is_from_config(ctx, fault.param.name):
+                raise
+            said = fault.format_message().rstrip(".")
+            raise UsageError(f"{ctx.params['config']}: {said[0].lower()}{said[1:]}; correct it there") from None
+
+    def invoke(self, ctx: Any) -> Any:
+        """As Typer does, where messages about an option's value start with the option."""
+        try:
+            return super().invoke(ctx)
+        except UsageError as fault:
+            flag = re.match(r"--([a-z][a-z-]*)", str(fault))
+            if flag is None or not _is_from_config(ctx, _identifier(flag[1])):
+                raise
+            raise UsageError(f"{ctx.params['config']}: {fault}") from None
+
+
+def _is_from_config(context: typer.Context, name: str | None) -> bool:
+    source = context.get_parameter_source(name or "")
+    return source is not None and source.name == "DEFAULT_MAP"
 
 
 def _apply_config(context: typer.Context, path: Path | None) -> Path | None:
@@ -67,15 +98,17 @@ def _defaults_from(path: Path, context: typer.Context) -> dict[str, Any]:
             if key not in options[table]:
                 raise UsageError(f"{path}: {table} has no option {_flag(key)}; see pcdenoise {table} --help")
     called = str(context.command.name)
-    known = options[called]
+    takes_many = {p.name: p.nargs == -1 or getattr(p, "multiple", False) for p in context.command.params}
     merged = {**everywhere, **tables.get(called, {})}
-    return {key: _as_typed_on_a_command_line(value) for key, value in merged.items() if key in known}
+    return {key: _as_typed(value, takes_many[key]) for key, value in merged.items() if key in options[called]}
 
 
-def _as_typed_on_a_command_line(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_as_typed_on_a_command_line(item) for item in value]
-    return value if isinstance(value, bool) else str(value)
+def _as_typed(value: Any, takes_many: bool) -> Any:
+    """A value as it stands on a command line: a list for what may be given several times, else with commas between."""
+    if isinstance(value, bool):
+        return value
+    words = [str(item) for item in value] if isinstance(value, list) else [str(value)]
+    return words if takes_many else ",".join(words)
 
 
 def _identifier(key: str) -> str:
