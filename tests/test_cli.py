@@ -73,6 +73,7 @@ def test_denoise_moves_points_and_keeps_rows_and_attributes(sphere: Path) -> Non
         (["denose", "sphere.xyz"], 2, "denose"),
         (["train", "-o", "m", "--budget", "soon"], 2, "--budget"),
         (["train", "-o", "m", "--budget", "0s"], 2, "--budget:"),
+        (["verify", "sphere.xyz", "sphere.xyz", "--max-move", "-1"], 2, "'--max-move'"),
         (["tune", "nowhere", "--method", "mean"], 3, "nowhere: no such file or folder; check the path"),
         (["info", "sphere.xyz", "broken.las", "--picture", "pics"], 2, "--picture pics: 2 inputs need a folder"),
         (["undo", "sphere.xyz", "-o", "x.xyz"], 3, "--displacement"),

@@ -60,7 +60,7 @@ def info(
         if job.source in {**pictures, **maps}:
             noise = _noise_of_rows(scan, seed, threads or -1)
             if target := pictures.get(job.source):
-                _draw(target, scan, noise, overwrite)
+                _draw(target, scan, noise, found["unit"], overwrite)
             if target := maps.get(job.source):
                 target.parent.mkdir(parents=True, exist_ok=True)
                 marked = scan.with_attributes(noise=noise.astype("f4"))
@@ -91,12 +91,17 @@ def _noise_of_rows(scan: Scan, seed: int, threads: int) -> NDArray[np.float64]:
     return values
 
 
-def _draw(path: Path, scan: Scan, noise: NDArray[np.float64], overwrite: bool) -> None:
+def _draw(path: Path, scan: Scan, noise: NDArray[np.float64], unit: str, overwrite: bool) -> None:
+    import numpy as np
+
     from pcdenoise.evaluation.colours import Scalar
     from pcdenoise.evaluation.pictures import render, write_png
 
+    label = f"Noise ({unit})" if unit else "Noise"
+    if np.isnan(noise[scan.finite]).any():
+        label += "; grey: no surface shows"
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_png(path, render(scan.points, colour=Scalar(noise, "Noise")), overwrite=overwrite)
+    write_png(path, render(scan.points, colour=Scalar(noise, label)), overwrite=overwrite)
 
 
 def _as_text(path: Path, found: dict[str, Any]) -> str:
