@@ -184,7 +184,7 @@ def coordinate_system(scan: Scan) -> Crs | None:
 
 
 def coordinate_step(scan: Scan) -> float | None:
-    """The step that the file rounds moved coordinates to: the scale of a LAS; None for all others, whose numbers have room."""
+    """What the file rounds moved coordinates to: the scale of a LAS, else None: text gets the decimals that it needs."""
     return float(np.abs(scan.source.file.field("scale")).max()) if isinstance(scan.source, las.LasSource) else None
 
 
