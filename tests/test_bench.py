@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,31 @@ def test_bench_writes_a_row_for_each_method_and_noise(tmp_path: Path, capsys: py
     for added in ("0.0", "1.0"):
         assert errors["network default", added] < 0.8 * errors["as it is", added]
     assert "network default" in capsys.readouterr().out
+
+
+def test_the_page_of_bench_says_what_the_terminal_says_and_names_its_model(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scan, broken, page, report = (tmp_path / name for name in ("scan.ply", "broken.ply", "bench.html", "bench.json"))
+    pcdenoise.write(Scan(cloud("sphere", 2000, 0.5).noisy), scan)
+    broken.write_bytes(b"ply\nformat nonsense\n")
+    command = ["bench", str(broken), str(scan), "--added", "0,1", "--model", "default", "-q", "--threads", "1"]
+    for path in (page, report):
+        assert main([*command, "--report", str(path)]) == 1
+    text = page.read_text()
+    headings = [text.index(f">{name}<") for name in ("Error +0x", "Error +1x", "CPU (s)", "Spacing variation")]
+    assert headings == sorted(headings)
+    row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("as it is"))
+    written = json.loads(report.read_text())
+    evenness = [
+        record["figures"]["spacing_variation"]
+        for record in written["files"]
+        if record["status"] == "done" and record["figures"]["method"] == "as it is"
+    ]
+    assert row.split()[-1] == f"{np.mean(evenness):.4g}"
+    assert written["settings"]["models"] == ["default"]
+    assert len(written["settings"]["models_sha256"][0]) == 64
+    assert written["figures"]["failed"] == 1
 
 
 def test_bench_refuses_what_it_cannot_judge(tmp_path: Path, rng: np.random.Generator) -> None:

@@ -72,6 +72,10 @@ def test_denoise_moves_points_and_keeps_rows_and_attributes(sphere: Path) -> Non
         (["denoise", "sphere.xyz", "-o", "x.xyz", "--no-such-option"], 2, "--no-such-option"),
         (["denose", "sphere.xyz"], 2, "denose"),
         (["train", "-o", "m", "--budget", "soon"], 2, "--budget"),
+        (["train", "-o", "m", "--budget", "0s"], 2, "--budget:"),
+        (["verify", "sphere.xyz", "sphere.xyz", "--max-move", "-1"], 2, "'--max-move'"),
+        (["tune", "nowhere", "--method", "mean"], 3, "nowhere: no such file or folder; check the path"),
+        (["info", "sphere.xyz", "broken.las", "--picture", "pics"], 2, "--picture pics: 2 inputs need a folder"),
         (["undo", "sphere.xyz", "-o", "x.xyz"], 3, "--displacement"),
     ],
 )
@@ -180,6 +184,42 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(sphere: Path, capsys: pyte
     assert not out.exists()
 
 
+@pytest.mark.parametrize(
+    ("options", "code", "words"),
+    [
+        (["-o", "there.xyz"], 3, "there.xyz: the file exists"),
+        (["-o", "c.xyz", "--model", "nope"], 4, "nope: no such model"),
+        (["-o", "c.xyz", "--only-class", "2"], 3, "has no classes"),
+        (["-o", "c.abc"], 3, "c.abc: no suffix tells its format"),
+        (["-o", "c.bin", "--method", "mean"], 3, "would drop"),
+        (["-o", "c.xyz", "--tile", "1000", "--outliers", "remove"], 2, "use --outliers flag, or leave out --tile"),
+    ],
+)
+def test_a_dry_run_refuses_what_the_run_refuses(
+    options: list[str], code: int, words: str, sphere: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(sphere.parent)
+    Path("there.xyz").touch()
+    for command in (["denoise", "sphere.xyz", *options, "--dry-run"], ["denoise", "sphere.xyz", *options]):
+        assert main(command) == code
+        assert words in the_one_line(capsys.readouterr().err)
+    assert sorted(path.name for path in Path().iterdir()) == ["sphere.xyz", "there.xyz"]
+
+
+def test_a_plan_goes_on_past_a_broken_input(
+    sphere: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(sphere.parent)
+    Path("broken.ply").write_bytes(b"ply\nformat nonsense\n")
+    assert main(["denoise", "broken.ply", "sphere.xyz", "-o", "out/", "--dry-run", *FAST]) == 1
+    rows = capsys.readouterr().out.splitlines()
+    assert rows[2].startswith("broken.ply")
+    assert "no end_header" in rows[2]
+    assert rows[3].startswith("sphere.xyz")
+    assert rows[3].endswith("ready")
+    assert not Path("out").exists()
+
+
 def strength_used(sphere: Path, *arguments: str) -> float:
     report = sphere.with_name("report.json")
     code = main(
@@ -217,7 +257,9 @@ def test_a_flag_beats_the_environment_beats_the_file_beats_the_default(sphere: P
         ("[denose]\nstrength = 0.5\n", "denose"),
         ("hue = 1\n", "--hue"),
         ("strength = \n", "TOML"),
-        ("[denoise]\nstrength = 'half'\n", "strength"),
+        ("[denoise]\nstrength = 'half'\n", "settings.toml: invalid value for '--strength'"),
+        ("[denoise]\nstrength = 1.5\n", "settings.toml: --strength: must be"),
+        ("[denoise]\nonly-class = [2, -6]\n", "settings.toml: --only-class 2,-6: give"),
     ],
 )
 def test_a_wrong_key_or_value_in_the_config_file_is_refused(
@@ -227,6 +269,22 @@ def test_a_wrong_key_or_value_in_the_config_file_is_refused(
     settings.write_text(text)
     assert main(["denoise", str(sphere), "-o", str(sphere.with_name("c.xyz")), "--config", str(settings), *FAST]) == 2
     assert words in the_one_line(capsys.readouterr().err)
+
+
+def test_a_list_in_the_config_file_is_joined_or_given_item_by_item(
+    sphere: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(sphere.parent)
+    Path("s.toml").write_text(
+        '[denoise]\nroi = [-2, -2, 2, 2.5]\ninputs = "sphere.xyz"\n[synth]\nlevels = [0.5, 1]\n[bench]\nadded = [0, 1.5]\n'
+        'model = "default"\n'
+    )
+    assert main(["denoise", "-o", "c.ply", "--config", "s.toml", "--report", "r.json", "-q", *FAST]) == 0
+    assert json.loads(Path("r.json").read_text())["settings"]["roi"][:4] == [-2, -2, None, 2]
+    assert main(["synth", "shapes:1", "-o", "data", "--points", "50", "--config", "s.toml", "-q"]) == 0
+    assert json.loads(Path("data/dataset.json").read_text())["levels_percent_of_diagonal"] == [0.5, 1]
+    assert main(["bench", "sphere.xyz", "--config", "s.toml", "--points", "1000", "-q"]) == 0
+    assert "error +1.5x" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -335,6 +393,49 @@ def test_pairs_give_a_foreign_trainer_noisy_and_pseudo_clean_rows(sphere: Path) 
     moved = columns(text / "sphere_0001_clean.xyz")[:, :3] - columns(text / "sphere_noisy.xyz")[:, :3]
     assert 0 < np.linalg.norm(moved, axis=1).max() < 0.1001
     assert main(["pairs", str(sphere), "-o", str(out), "--prior", "full", "--overwrite", "-q"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("command", "names"),
+    [
+        (["iterate", "--iters", "1", *FAST], ["passes.png", "report.html", "stdin_1.xyz"]),
+        (["iterate", "--iters", "1", "--format", "xyz", *FAST], ["passes.png", "report.html", "stdin_1.xyz"]),
+        (["split", "--points", "1500"], ["stdin_0001.xyz", "stdin_0002.xyz"]),
+        (["pairs", "--draws", "1"], ["stdin_0001.npz"]),
+    ],
+)
+def test_what_comes_from_stdin_is_named_so_with_a_suffix(command: list[str], names: list[str], sphere: Path, run: Run) -> None:
+    out = sphere.with_name("out")
+    done = run(command[0], "-", "-o", out, *command[1:], input=sphere.read_bytes())
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in out.iterdir()) == names
+    assert b" 1 pairs" not in done.stderr
+    assert b" 1 passes" not in done.stderr
+
+
+@pytest.mark.parametrize("command", [["split", "--points", "1500"], ["pairs", "--draws", "1"]])
+def test_split_and_pairs_go_on_past_a_broken_input(
+    command: list[str], sphere: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(sphere.parent)
+    Path("broken.ply").write_bytes(b"ply\nformat nonsense\n")
+    assert main([command[0], "broken.ply", "-o", "none", *command[1:]]) == 3
+    assert not Path("none").exists()
+    capsys.readouterr()
+    assert main([command[0], "broken.ply", "sphere.xyz", "-o", "out", *command[1:], "-q"]) == 1
+    assert capsys.readouterr().err.splitlines()[-1] == "pcdenoise: 1 of 2 inputs failed; the others are done"
+    assert any(path.name.startswith("sphere_0001") for path in Path("out").iterdir())
+
+
+@pytest.mark.parametrize("command", [["iterate"], ["split"], ["pairs"], ["synth"], ["train", "--steps", "1"]])
+def test_a_file_in_the_place_of_a_folder_is_told(
+    command: list[str], sphere: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(sphere.parent)
+    Path("afile").touch()
+    source = {"synth": ["shapes:1"], "train": []}.get(command[0], ["sphere.xyz"])
+    assert main([command[0], *source, "-o", "afile", *command[1:]]) in (3, 4)
+    assert "afile: is a file where a folder is needed" in the_one_line(capsys.readouterr().err)
 
 
 def test_what_tune_writes_denoise_reads(tmp_path: Path, rng: np.random.Generator) -> None:

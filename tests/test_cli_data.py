@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import get_args
@@ -11,6 +12,7 @@ import pytest
 
 import pcdenoise
 from pcdenoise.commands import main, synth
+from pcdenoise.networks import store
 
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
 
@@ -114,6 +116,16 @@ def test_eval_chamfer_is_zero_for_the_truth_itself_and_needs_one(data: Path, cap
     assert "--clean" in capsys.readouterr().err
 
 
+def test_eval_chamfer_names_the_file_that_is_empty(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    clean, empty = str(data / "shape_0000_clean.ply"), data / "empty.ply"
+    pcdenoise.write(pcdenoise.Scan(np.zeros((0, 3))), empty)
+    for result, truth in ((str(empty), clean), (clean, str(empty))):
+        assert main(["eval-chamfer", result, "--clean", truth]) == 3
+        captured = capsys.readouterr()
+        assert captured.err.startswith(f"pcdenoise: {empty}: has 0 points with coordinates")
+        assert captured.out == ""
+
+
 def test_iterate_writes_every_pass_a_table_a_strip_and_a_page(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = data / "steps"
     noisy, clean = data / "shape_0000_gaussian_1.ply", data / "shape_0000_clean.ply"
@@ -124,6 +136,24 @@ def test_iterate_writes_every_pass_a_table_a_strip_and_a_page(data: Path, capsys
     table = capsys.readouterr().out.splitlines()
     assert len(table) == 2 + 3  # header, rule, before, two passes
     assert "cd" in table[0]
+
+
+def test_iterate_says_in_its_page_and_in_every_pass_what_made_them_and_refuses_passes_that_are_there(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = data / "steps"
+    command = ["iterate", str(data / "shape_0000_gaussian_1.ply"), "-o", str(out), "--iters", "1", "-q"]
+    assert main(command) == 0
+    sha = hashlib.sha256((store.shipped() / "default" / store.WEIGHTS).read_bytes()).hexdigest()
+    written = out / "shape_0000_gaussian_1_1.ply"
+    assert sha in (out / "report.html").read_text()
+    assert sha.encode() in written.read_bytes()[:4096]
+    for name in ("report.html", "passes.png"):
+        (out / name).unlink()
+    capsys.readouterr()
+    assert main(command) == 3
+    assert f"{written}: the file exists" in capsys.readouterr().err
+    assert list(out.iterdir()) == [written]
 
 
 def test_iterate_ends_where_denoise_ends(data: Path) -> None:
@@ -141,7 +171,10 @@ def test_models_lists_the_default_model_and_prints_its_card(capsys: pytest.Captu
     assert json.loads(capsys.readouterr().out)[0]["n_parameters"] > 1000
     assert main(["models", "default"]) == 0
     assert len(capsys.readouterr().out) > 500
+    assert main(["models", "default", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["name"] == "default"
     assert main(["models", "no-such-model"]) == 4
+    assert "no such model; give" in capsys.readouterr().err
 
 
 def test_a_model_trained_for_two_steps_can_be_used_and_listed(data: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import pcdenoise
-from io_samples import las, vlr
+from io_samples import SCALE, las, las_records, vlr
 from known_clouds import UTM, ball, cloud
 from pcdenoise.cloud import noise_level
 from pcdenoise.cloud.scan import Scan
@@ -91,12 +91,28 @@ def test_traps_are_named_and_an_ordinary_scan_has_none(tmp_path: Path) -> None:
     assert warnings_of(Scan(sample.noisy)) == ""
     far = (sample.noisy + UTM).astype(np.float32).astype(np.float64)
     assert "float32" in warnings_of(Scan(far))
-    assert "step of 0.1" in warnings_of(Scan(np.round(sample.noisy + UTM, 1)))
     assert "degrees" in warnings_of(Scan(sample.noisy * [1e-5, 1e-5, 100.0] + [7.5, 48.0, 100.0]))
     for key, words in ((UTM_WKT, "heights in US survey foot"), ('GEOGCS["WGS 84",UNIT["degree",0.0174532925199433]]', "degrees")):
         path = tmp_path / f"{words}.las"
         path.write_bytes(las(4, 6, vlrs=[vlr(b"LASF_Projection", crs.WKT, key.encode())]))
         assert words in warnings_of(pcdenoise.read(path))
+
+
+def test_a_step_that_swallows_moves_is_that_of_a_las_and_of_nothing_else(tmp_path: Path) -> None:
+    """A plane whose noise is half of the coarsest step of the file; a text of the same numbers gets the decimals it needs."""
+    sample = cloud("plane", 4000, 0.5)
+    points = 0.01 / sample.spacing * sample.noisy
+    records = las_records(6, len(points), 0)
+    records[:, :12] = np.rint(points / SCALE).astype("<i4").view(np.uint8).reshape(-1, 12)
+    (tmp_path / "coarse.las").write_bytes(las(4, 6, records=records))
+    scan = pcdenoise.read(tmp_path / "coarse.las")
+    assert "step of 0.01" in warnings_of(scan)
+    pcdenoise.write(Scan(np.round(scan.points, 2)), tmp_path / "coarse.xyz")
+    text = pcdenoise.read(tmp_path / "coarse.xyz")
+    assert "step" not in warnings_of(text)
+    moved = text.moved_to(text.points + 1e-4)
+    pcdenoise.write(moved, tmp_path / "moved.xyz")
+    assert np.allclose(pcdenoise.read(tmp_path / "moved.xyz").points, moved.points, rtol=0, atol=1e-5)
 
 
 def test_info_writes_the_map_as_a_column_and_a_picture_and_both_only_once(
@@ -117,12 +133,12 @@ def test_info_writes_the_map_as_a_column_and_a_picture_and_both_only_once(
 def test_the_plan_of_a_dry_run_names_cost_and_traps_and_writes_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = tmp_path / "coarse.xyz"
-    np.savetxt(path, np.round(cloud("plane", 3000, 0.5).noisy, 1), fmt="%.1f")
+    path = tmp_path / "far.ply"
+    pcdenoise.write(Scan((cloud("plane", 3000, 0.5).noisy + UTM).astype(np.float32).astype(np.float64)), path)
     assert main(["denoise", str(path), "--dry-run"]) == 0
     said = capsys.readouterr().out
     assert "CPU s" in said
-    assert "step of 0.1" in said
+    assert "rounded to float32" in said
     assert list(tmp_path.iterdir()) == [path]
 
 

@@ -119,6 +119,7 @@ def test_every_command_and_every_option_has_help_and_the_list_of_commands_says_t
 
     for name, command in typer.main.get_command(app()).commands.items():  # type: ignore[attr-defined]
         assert command.help.split("\n\n")[0] == _SUMMARIES[name], name
+        assert "\n" not in command.help.replace("\n\n", ""), f"{name}: the terminal breaks lines, not the source"
         for parameter in command.params:
             assert parameter.help, f"{name} {parameter.name}"
 

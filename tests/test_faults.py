@@ -248,7 +248,7 @@ def test_a_signal_that_was_ignored_stays_ignored(monkeypatch: pytest.MonkeyPatch
 
 SHELL = {
     "denoise {scan} -o - --format xyz -q --method mean > /dev/full": (3, "stdout: cannot be written"),
-    "info {scan} > /dev/full": (3, "No space left on device"),
+    "info {scan} > /dev/full": (3, "stdout: No space left on device"),
     "info {scan} >&-": (3, "Bad file descriptor"),
     "denoise {scan} -o {scan}.ply -q --method mean 2>&-": (0, ""),
     "info {scan}.none 2>&-": (3, ""),

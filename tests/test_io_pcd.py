@@ -151,7 +151,8 @@ DAMAGED = {
     "billions of lines": (TEXT.replace(b" 60\n", b" 6000000000\n"), "claims 6000000000"),
     "billions of packed points": (PACKED.replace(b"60", b"6000000000"), "header claims"),
     "cut in the points": (BINARY[:-3], "holds 59"),
-    "cut in the packed points": (PACKED[:-3], "header claims"),
+    "cut in the packed points": (PACKED[:-3], "are there; it is cut off"),
+    "cut before the packed points": (PACKED[: PACKED.index(b"DATA") + 27], "ends before its points"),
     "packed points that unpack to fewer": (PACKED[:-33] + b"\x00" * 33, "compressed data"),
 }
 

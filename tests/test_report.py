@@ -161,6 +161,7 @@ def test_figures_stand_on_the_page_as_people_write_them(tmp_path: Path) -> None:
     page = written(tmp_path / "r.html", tables={"Steps": [{"moved_m": 0.25, "kept": True}, {"moved_m": None, "kept": False}]})
     for words in ("Noise std (m)", "0.5", "Moved (m)", "yes", "no", "\u2013"):
         assert words in page.text
+    assert '<td class="number">0.5</td>' in (tmp_path / "r.html").read_text()  # numbers are not broken
     assert not any(attributes.get("id") == "viewer" and "hidden" not in attributes for _, attributes in page.elements)
 
 

@@ -10,6 +10,8 @@
 A message is one line that names the file (or setting), the fault and the fix.
 """
 
+import os
+
 _OUT_OF_MEMORY = (
     "can't allocate memory",
     "not enough memory",
@@ -65,8 +67,15 @@ def of_the_system(fault: Exception, place: str = "") -> ScanError | None:
         )
     if isinstance(fault, OSError) and not isinstance(fault, BrokenPipeError):
         where = place if fault.filename is None else fault.filename
+        if isinstance(fault, FileExistsError) and where:  # of mkdir, which is content with a folder
+            return not_a_folder(os.fsdecode(where))
         return ScanError(f"{where or 'stdout'}: {fault.strerror or said}; check the path, its permissions and free space")
     return None
+
+
+def not_a_folder(path: str) -> ScanError:
+    """What the user is told where a file stands in the place of a folder."""
+    return ScanError(f"{path}: is a file where a folder is needed; choose another name")
 
 
 def in_one_line(fault: BaseException) -> str:

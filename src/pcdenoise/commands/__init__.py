@@ -21,7 +21,7 @@ import typer
 
 from pcdenoise import __version__
 from pcdenoise.commands import options
-from pcdenoise.commands.help import import_rich_help
+from pcdenoise.commands.help import import_rich_help, paragraphs
 from pcdenoise.errors import PcdenoiseError, of_the_system
 
 EXIT_CODES = """\
@@ -70,8 +70,10 @@ def _import_into(group: typer.Typer, name: str) -> None:
     """Adds the command that is the function of this name in the module of this name."""
     word = name.replace("-", "_")
     settings = {**_HELP, "auto_envvar_prefix": options.ENVIRONMENT_PREFIX}
-    add = group.command(name, context_settings=settings, no_args_is_help=name != "models")
-    add(getattr(import_module(f"{__name__}.{word}"), word))
+    command = getattr(import_module(f"{__name__}.{word}"), word)
+    said = paragraphs(command.__doc__)
+    add = group.command(name, cls=options.Command, help=said, context_settings=settings, no_args_is_help=name != "models")
+    add(command)
 
 
 def _not_imported() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from pcdenoise.commands.console import Console
@@ -22,12 +22,19 @@ class Batch:
         self.records: list[dict[str, Any]] = []
         self._errors: list[PcdenoiseError] = []
 
-    def run(self, jobs: Sequence[Job], work: Work, engine: Engine = here) -> None:
-        """One record per job, in the jobs' order, whatever the order in which they are done."""
+    def run(
+        self, jobs: Sequence[Job], work: Work, engine: Engine = here, show: Callable[[Job, Figures], None] | None = None
+    ) -> None:
+        """One record per job, in the jobs' order, whatever the order in which they are done.
+
+        show: prints what was found about a job. A stdout that takes no more is no fault of the job, and ends the run.
+        """
         records: dict[Job, dict[str, Any]] = {}
         for outcome in engine(jobs, work):
             if outcome.said and not self.console.quiet:
                 print(outcome.said, end="", file=sys.stderr, flush=True)
+            if show and outcome.figures is not None:
+                show(outcome.job, outcome.figures)
             records[outcome.job] = self._record(outcome, is_single=len(jobs) == 1)
         self.records += [records[job] for job in jobs]
 

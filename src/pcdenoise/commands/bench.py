@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pcdenoise.commands import options, outputs
+from pcdenoise.commands.batch import Batch, Figures
 from pcdenoise.commands.console import Console, figure, table
-from pcdenoise.commands.files import expand, format_of, refuse_existing
+from pcdenoise.commands.files import STREAM, Job, expand, format_of, refuse_existing
 from pcdenoise.commands.options import configured, option
 from pcdenoise.errors import ScanError, UsageError
 
@@ -36,7 +37,7 @@ def bench(
         str, option("--added", metavar="TIMES,...", help="Noise added on top, in multiples of the scan's own.")
     ] = "0,1,2",
     points: Annotated[int, option("--points", min=FEWEST_POINTS, help="Of a larger scan, a compact part of so many.")] = 40_000,
-    format: options.Format = None,
+    format: options.FormatRead = None,
     report: options.Report = None,
     overwrite: options.Overwrite = False,
     config: options.Config = None,
@@ -55,31 +56,52 @@ def bench(
     """
     from pcdenoise import io
     from pcdenoise.evaluation.report import Page
+    from pcdenoise.networks import store
 
     times = _times(added)
     refuse_existing([report], overwrite)
     console = Console(quiet)
-    records: list[dict[str, Any]] = []
-    for source in expand(inputs):
-        scan = io.read(source, format=format_of(source, format))
-        trial = _Trial.of(scan.points[scan.finite], points, seed, threads or -1, source)
+    jobs = [Job(source, STREAM) for source in expand(inputs)]
+    models = {name: store.load(name) for name in model or [entry.name for entry in store.available()]}
+
+    def compare(job: Job) -> Figures:
+        scan = io.read(job.source, format=format_of(job.source, format))
+        trial = _Trial.of(scan.points[scan.finite], points, seed, threads or -1, job.source)
         rows = []
-        with console.progress(source.name) as on_progress:
-            methods = list(_methods(model, trial.level, seed, threads))
+        with console.progress(job.source.name) as on_progress:
+            methods = list(_methods(models, trial.level, seed, threads))
             for place, (name, smoother) in enumerate(methods):
                 on_progress(name, place / len(methods))
                 rows += [{"method": name, **trial.run(smoother, share, seed)} for share in times]
-        records += [{"input": str(source), "output": "", "status": "done", "figures": row} for row in rows]
-        print(_as_text(source, rows, times, trial), end="\n\n" if len(inputs) > 1 else "\n")
+        return {"points": len(trial.given), "noise": trial.level.std, "rows": rows}
+
+    def show(job: Job, found: Figures) -> None:
+        print(_as_text(job.source, found, times), end="\n\n" if len(jobs) > 1 else "\n")
+
+    batch = Batch(console)
+    batch.run(jobs, compare, show=show)
     if report:
-        settings = {"models": model, "added": times, "points": points, "seed": seed, "threads": threads}
-        tables = {"Methods": _by_method(records)}
-        page: Page = Page(tables=tables, lead="Distance of cleaned points from a surface through points that no method saw.")
-        figures = {
-            "scans": len({record["input"] for record in records}),
-            "methods": len({row["method"] for row in tables["Methods"]}),
+        settings = {
+            "models": list(models),
+            "models_sha256": [loaded.sha256 for loaded in models.values()],
+            "added": times,
+            "points": points,
+            "seed": seed,
+            "threads": threads,
         }
-        outputs.save_report(report, "bench", settings, records, page, figures=figures, overwrite=overwrite)
+        done = [record for record in batch.records if record["status"] == "done"]
+        lines = [{"input": record["input"], **line} for record in done for line in _by_method(record["figures"]["rows"])]
+        page: Page = Page(
+            tables={"Methods": lines} if done else {},
+            lead="Distance of cleaned points from a surface through points that no method saw.",
+        )
+        figures = {
+            "scans": len(done),
+            "failed": outputs.n_failed(batch.records),
+            "methods": len({row["method"] for row in lines}),
+        }
+        outputs.save_report(report, "bench", settings, _by_row(batch.records), page, figures=figures, overwrite=overwrite)
+    batch.close()
 
 
 @dataclass(frozen=True)
@@ -122,18 +144,17 @@ class _Trial:
         return {"added": share, "error": self.judge.error(cleaned), "cpu_s": spent, "spacing_variation": evenness}
 
 
-def _methods(models: list[str] | None, level: NoiseLevel, seed: int, threads: int | None) -> Iterator[tuple[str, Smoother]]:
+def _methods(models: dict[str, Model], level: NoiseLevel, seed: int, threads: int | None) -> Iterator[tuple[str, Smoother]]:
     """Name and function of everything that is compared; Open3D's only where it loads."""
     from functools import partial
 
     from pcdenoise.config import DenoiseConfig
     from pcdenoise.denoising import classical
-    from pcdenoise.networks import store
 
     config = configured(DenoiseConfig, seed=seed, threads=threads)
     yield "as it is", _as_it_is
-    for name in models or [entry.name for entry in store.available()]:
-        yield f"network {name}", _network(store.load(name), config)
+    for name, model in models.items():
+        yield f"network {name}", _network(model, config)
     n_threads = threads or -1
     yield "mean", partial(classical.mean, threads=n_threads)
     yield "bilateral", partial(classical.bilateral, threads=n_threads)
@@ -183,27 +204,50 @@ def _open3d_smoother(o3d: Any, name: str, arguments: tuple[Any, ...]) -> Smoothe
     return smooth
 
 
-def _by_method(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row for each scan and method, its errors side by side."""
-    rows: dict[tuple[str, str], dict[str, Any]] = {}
-    for record in records:
-        figures = record["figures"]
-        row = rows.setdefault((record["input"], figures["method"]), {"input": record["input"], "method": figures["method"]})
-        row[f"error +{figures['added']:g}x"] = figures["error"]
-        row |= {"cpu_s": round(figures["cpu_s"], 3), "spacing_variation": figures["spacing_variation"]}
-    return list(rows.values())
-
-
-def _as_text(source: Path, rows: list[dict[str, Any]], times: list[float], trial: _Trial) -> str:
-    best = {share: min(row["error"] for row in rows if row["added"] == share) for share in times}
+def _by_method(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row for each method on one scan: its errors side by side, then means over the noises of CPU seconds and evenness."""
     lines = []
     for name in dict.fromkeys(row["method"] for row in rows):
         own = [row for row in rows if row["method"] == name]
-        errors = [figure(row["error"]) + (" *" if row["error"] == best[row["added"]] else "  ") for row in own]
-        lines.append([name, *errors, f"{sum(row['cpu_s'] for row in own) / len(own):.2f}", figure(own[0]["spacing_variation"])])
-    head = f"{source}: {len(trial.given):,} points cleaned, as many held back; noise {figure(trial.level.std)}"
-    headers = ["method", *(f"error +{share:g}x  " for share in times), "CPU s", "evenness"]
-    foot = "error: distance from the surface, lower is better, * best; evenness: std / mean of spacing, lower is more even"
+        errors = {_error_at(row["added"]): row["error"] for row in own}
+        means = {key: sum(row[key] for row in own) / len(own) for key in ("cpu_s", "spacing_variation")}
+        lines.append({"method": name, **errors, **means})
+    return lines
+
+
+def _error_at(share: float) -> str:
+    return f"error +{share:g}x"
+
+
+def _by_row(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The records of a report: one for each method and noise on a scan, and one for a scan that failed."""
+    found = []
+    for record in records:
+        rows = record["figures"]["rows"] if record["status"] == "done" else []
+        found += [{**record, "figures": row} for row in rows] or [record]
+    return found
+
+
+def _as_text(source: Path, found: Figures, times: list[float]) -> str:
+    """The rows of `_by_method` for a person, the best error of each noise marked."""
+    rows = _by_method(found["rows"])
+    names = [_error_at(share) for share in times]
+    best = {name: min(row[name] for row in rows) for name in names}
+    lines = [
+        [
+            row["method"],
+            *(figure(row[name]) + (" *" if row[name] == best[name] else "  ") for name in names),
+            f"{row['cpu_s']:.2f}",
+            figure(row["spacing_variation"]),
+        ]
+        for row in rows
+    ]
+    head = f"{source}: {found['points']:,} points cleaned, as many held back; noise {figure(found['noise'])}"
+    headers = ["method", *(f"{name}  " for name in names), "CPU s", "evenness"]
+    foot = (
+        "error: distance from the surface, lower is better, * best; evenness: std / mean of spacing, lower is more even; "
+        "CPU and evenness are means over the noises"
+    )
     return "\n".join([head, table(headers, lines), foot])
 
 

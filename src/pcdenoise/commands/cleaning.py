@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from pcdenoise import __version__
 from pcdenoise.commands import outputs, selection
 from pcdenoise.commands.batch import Figures
-from pcdenoise.commands.console import Console, figure
+from pcdenoise.commands.console import Console, counted, figure
 from pcdenoise.commands.files import STREAM, Job, format_of
 from pcdenoise.commands.undo import refuse_taken, with_colours, with_displacement, with_outliers, with_uncertainty
 from pcdenoise.commands.verify import check_drift
@@ -48,6 +48,11 @@ def refuse_model(name: str | None, settings: DenoiseConfig) -> None:
     """Raises UsageError where a model is named that no one would use."""
     if settings.method != "network" and name is not None:
         raise UsageError(f"--model {name}: --method {settings.method} uses no model; leave one of the two out")
+
+
+def named_model(model: Model | None) -> dict[str, str]:
+    """A model as reports and provenance name it; nothing for a classical filter."""
+    return {"model": model.name, "model_sha256": model.sha256} if model else {}
 
 
 def cells_of(job: Job) -> Path:
@@ -96,7 +101,7 @@ class Cleaning:
     @property
     def settings(self) -> dict[str, Any]:
         """Everything that shaped the result, by name, for the report and the file's provenance."""
-        named = {"model": self.model.name, "model_sha256": self.model.sha256} if self.model else {}
+        named = named_model(self.model)
         colour = {"colour": True} if self.colour else {}
         return {**self.config.model_dump(mode="json"), **self.selection.settings, **named, **colour}
 
@@ -113,23 +118,43 @@ class Cleaning:
     def clean(self, job: Job) -> Figures:
         """Reads one scan, cleans it, writes it with its picture, and returns its figures; in cells on disk if it is too large."""
         from pcdenoise import io
-        from pcdenoise.denoising.tiles import needed_bytes
 
         with io.streamed(job.source, format=format_of(job.source, self.format)) as stream:
-            if stream is not None and (self.tile or needed_bytes(stream.n_points) > self.max_bytes):
+            if stream is not None and (self.tile or self._is_too_large(stream)):
                 return self._clean_in_cells(job, stream)
         if self.tile:
             self.console.note(f"{job.source}: read whole; only LAS, LAZ, binary PLY and text files are cleaned in cells")
         return self._clean_whole(job)
 
-    def _clean_in_cells(self, job: Job, stream: Stream) -> Figures:
-        """The same for a scan that need not fit in memory: rows are streamed, cells lie in a folder beside the target."""
+    def look(self, job: Job) -> Figures:
+        """A survey of one scan for a plan, after what `clean` would refuse without any work has been refused."""
         from pcdenoise import io
-        from pcdenoise.denoising.tiles import Tiles, needs_the_whole, points_per_cell
+        from pcdenoise.commands.survey import survey
 
-        started = time.perf_counter()
+        with io.streamed(job.source, format=format_of(job.source, self.format)) as stream:
+            if stream is not None and (self.tile or self._is_too_large(stream)):
+                self._refuse_cells(job, stream)
+        scan = io.read(job.source, format=format_of(job.source, self.format))
+        self.selection.masks(scan)
+        written = format_of(job.target, self.format) or io.SUFFIXES.get(job.target.suffix.lower())
+        if written and not self.drop_attributes:
+            io.refuse_losses(scan, job.target, written)
+        return survey(scan, seed=self.config.seed, threads=self.config.threads or -1)
+
+    def _is_too_large(self, stream: Stream) -> bool:
+        from pcdenoise.denoising.tiles import needed_bytes
+
+        return needed_bytes(stream.n_points) > self.max_bytes
+
+    def _refuse_cells(self, job: Job, stream: Stream) -> None:
+        """Raises UsageError for what is not done where a scan is cleaned in cells."""
+        from pcdenoise import io
+        from pcdenoise.denoising.tiles import needs_the_whole
+
         written = format_of(job.target, self.format) or io.SUFFIXES.get(job.target.suffix.lower(), stream.format)
         global_ = needs_the_whole(self.model, self.config)
+        more = "raise --max-memory" if self._is_too_large(stream) else ""
+        other = " and ".join(filter(None, ["leave out --tile" if self.tile else "", more]))
         for is_asked, fault in (
             (self.config.outliers == "remove", "--outliers remove: use --outliers flag"),
             (self.colour, "--colour: leave it out"),
@@ -141,9 +166,16 @@ class Cleaning:
         ):
             if is_asked:
                 raise UsageError(
-                    f"{job.source}: {stream.n_points:,} points are cleaned in cells, which does not go with {fault}, "
-                    "or raise --max-memory"
+                    f"{job.source}: {stream.n_points:,} points are cleaned in cells, which does not go with {fault}, or {other}"
                 )
+
+    def _clean_in_cells(self, job: Job, stream: Stream) -> Figures:
+        """The same for a scan that need not fit in memory: rows are streamed, cells lie in a folder beside the target."""
+        from pcdenoise import io
+        from pcdenoise.denoising.tiles import Tiles, points_per_cell
+
+        started = time.perf_counter()
+        self._refuse_cells(job, stream)
         cell_points = self.tile or points_per_cell(self.max_bytes)
         job.target.parent.mkdir(parents=True, exist_ok=True)
         folder = cells_of(job)
@@ -246,7 +278,7 @@ def picture_notes(result: Result, unit: str) -> tuple[str, str]:
 
 def _summary(figures: Figures) -> str:
     """One line for a person: how many points, how noisy they were, how far they moved, what was left alone."""
-    parts = [f"{figures['points']:,} points"]
+    parts = [counted(figures["points"], "point")]
     if "points_selected" in figures:
         parts.append(f"{figures['points_selected']:,} selected")
     parts.append(f"noise {figure(figures['noise'])}" if figures["is_surface"] else "no surface to clean")

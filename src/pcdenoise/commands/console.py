@@ -71,6 +71,11 @@ def figure(value: float) -> str:
     return f"{value:.4g}"
 
 
+def counted(n: int, one: str, several: str = "") -> str:
+    """A number of things: `1 pass`, `12,575 points`."""
+    return f"{n:,} {one if n == 1 else several or one + 's'}"
+
+
 def _ignore(stage: str, share: float) -> None:
     del stage, share
 

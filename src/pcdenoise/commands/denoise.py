@@ -6,14 +6,14 @@ import os
 import shutil
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pcdenoise.commands import files, options, outputs, selection
 from pcdenoise.commands import workers as workers_
 from pcdenoise.commands.batch import Batch
 from pcdenoise.commands.cleaning import Cleaning, cells_of, refuse_model
 from pcdenoise.commands.console import Console, figure, table
-from pcdenoise.commands.files import STREAM, Job, expand, format_of, plan, refuse_existing
+from pcdenoise.commands.files import STREAM, Job, expand, plan, refuse_existing
 from pcdenoise.commands.memory import n_bytes
 from pcdenoise.commands.options import configured, option
 from pcdenoise.commands.verify import MaxDrift
@@ -40,6 +40,9 @@ Noise = Annotated[
     option("--noise", metavar="STD", help="Noise as a standard deviation in the file's unit; estimated if not given."),
 ]
 Iters = Annotated[str, option("--iters", metavar="N|auto", help="Passes; auto stops when the next would not help.")]
+
+_UNTOLD = Path("?")
+"""The output of a plan that names none."""
 
 
 def denoise(
@@ -123,19 +126,16 @@ def denoise(
     )  # fmt: skip
     console, sources = Console(quiet, verbose), expand(inputs)
     share = files.shard(sources, shard) if shard else sources
-    if dry_run:
-        print(_plan_text(share, output, suffix, format, settings))
-        return
-    if not output:
+    if not output and not dry_run:
         raise UsageError("-o is missing; say where the result goes: -o clean.las, -o folder/ or -o -")
     run = workers_.chosen(workers, engine, scheduler)
     is_far = run is not workers_.here
     if is_far:
         n_threads = 1 if engine == "dask" else max(1, (os.cpu_count() or 1) // workers)
         settings = settings.model_copy(update={"threads": settings.threads or n_threads})
-    jobs = plan(sources, output, suffix=suffix, format=format, share=share)
-    files.refuse_unknown([job.target for job in jobs], format)
-    drawn = plan(sources, str(picture), format="png", share=share) if picture else []
+    jobs = plan(sources, output, suffix=suffix, format=format, share=share) if output else [Job(at, _UNTOLD) for at in share]
+    files.refuse_unknown([job.target for job in jobs if output], format)
+    drawn = plan(sources, str(picture), format="png", share=share, option="--picture") if picture else []
     if is_far and any(STREAM in (job.source, job.target) for job in jobs):
         raise UsageError("-: workers have neither standard input nor output; name files, or leave --workers and --engine out")
     if engine == "dask":
@@ -144,7 +144,7 @@ def denoise(
     jobs = [job for job in jobs if job not in done]
     pictures = {picture.source: picture.target for picture in drawn if picture.source in {job.source for job in jobs}}
     refuse_existing([*(job.target for job in jobs), *pictures.values(), report], overwrite or resume)
-    for job in done if resume else jobs:
+    for job in [] if dry_run else done if resume else jobs:
         shutil.rmtree(cells_of(job), ignore_errors=True)
     chosen = selection.Selection.of(only_class, context, roi)
     refuse_model(model, settings)
@@ -153,9 +153,14 @@ def denoise(
         drop_attributes=drop_attributes, displacement=displacement, max_drift=max_drift, pictures=pictures,
         max_bytes=n_bytes(max_memory) // workers, tile=tile, colour=colour, is_reported=report is not None,
     )  # fmt: skip
-    if len(jobs) > 1 or is_far:
+    if len(jobs) > 1 or is_far or dry_run:
         _ = cleaning.model  # one that is missing ends the run here, not each of its inputs
     batch = Batch(console)
+    if dry_run:
+        batch.run(jobs, cleaning.look)
+        print(_plan_text(batch.records, done, settings))
+        batch.close()
+        return
     batch.run(jobs, cleaning.clean, run)
     if report:
         page = cleaning.pages[0] if len(jobs) == len(cleaning.pages) == 1 else None
@@ -163,26 +168,29 @@ def denoise(
     batch.close()
 
 
-def _plan_text(sources: list[Path], output: str, suffix: str, format: str | None, settings: DenoiseConfig) -> str:
-    """What a run would do, input by input, after a look at each."""
-    from pcdenoise import io
-    from pcdenoise.commands.survey import cost, cost_text, survey
+def _plan_text(records: list[dict[str, Any]], done: list[Job], settings: DenoiseConfig) -> str:
+    """What a run would do, input by input: those that were looked at, and those that have their outputs."""
+    from pcdenoise.commands.survey import cost, cost_text
 
-    jobs = plan(sources, output, suffix=suffix, format=format) if output else [Job(source, Path("?")) for source in sources]
     rows, warnings = [], []
-    for job in jobs:
-        found = survey(io.read(job.source, format=format_of(job.source, format)), seed=settings.seed)
-        noise = figure(found["noise"]) if found.get("is_surface") else "no surface"
+    for record in records:
+        if record["status"] == "failed":
+            rows.append([record["input"], *[""] * 5, record["output"], record["error"].removeprefix(f"{record['input']}: ")])
+            continue
+        found = record["figures"]
         rows.append(
             [
-                str(job.source),
+                record["input"],
                 f"{found['points']:,}",
                 figure(found.get("spacing", 0.0)),
-                noise,
+                figure(found["noise"]) if found.get("is_surface") else "no surface",
                 str(settings.iters),
                 cost_text(cost(found["points"], 3 if settings.iters == "auto" else settings.iters)),
-                str(job.target),
+                record["output"],
+                "ready",
             ]
         )
-        warnings += [f"warning: {job.source}: {text}" for text in found["warnings"]]
-    return "\n".join([table(["input", "points", "spacing", "noise", "passes", "cost", "output"], rows), *warnings])
+        warnings += [f"warning: {record['input']}: {text}" for text in found["warnings"]]
+    rows += [[str(job.source), *[""] * 5, str(job.target), "there already"] for job in done]
+    headers = ["input", "points", "spacing", "noise", "passes", "cost", "output", "status"]
+    return "\n".join([table(headers, rows, left={0, 6, 7}), *warnings])

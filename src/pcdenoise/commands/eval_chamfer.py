@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pcdenoise.commands import options, outputs
 from pcdenoise.commands.batch import Batch, Figures
-from pcdenoise.commands.console import Console, figure, table
-from pcdenoise.commands.files import STREAM, Job, expand, format_of, plan, refuse_existing
+from pcdenoise.commands.console import Console, counted, figure, table
+from pcdenoise.commands.files import STREAM, Job, beside, expand, format_of, refuse_existing
 from pcdenoise.commands.options import option
-from pcdenoise.errors import UsageError
+from pcdenoise.errors import ScanError, UsageError
 
 if TYPE_CHECKING:
     from pcdenoise.cloud.scan import Points
@@ -28,7 +28,7 @@ def eval_chamfer(
         option("--error-ply", metavar="OUT", help="Write errors as a coloured PLY: a file, or a folder for several."),
     ] = "",
     picture: Annotated[str, option("--picture", metavar="OUT", help="Write the histogram of errors as PNG, likewise.")] = "",
-    format: options.Format = None,
+    format: options.FormatRead = None,
     report: options.Report = None,
     overwrite: options.Overwrite = False,
     config: options.Config = None,
@@ -41,26 +41,36 @@ def eval_chamfer(
 
     Example: pcdenoise eval-chamfer result.ply --clean clean.ply --mesh surface.ply
     """
-    from pcdenoise import io
     from pcdenoise.synthesis.meshes import load_mesh
 
     if clean is None and mesh is None:
         raise UsageError("there is no truth to compare with; give --clean FILE, --mesh FILE or both")
     sources = expand(inputs)
-    coloured = {job.source: job.target for job in plan(sources, error_ply, suffix="_error", format="ply")} if error_ply else {}
-    pictures = {job.source: job.target for job in plan(sources, picture, suffix="_error", format="png")} if picture else {}
+    coloured = beside(sources, error_ply, "--error-ply", format="ply", suffix="_error")
+    pictures = beside(sources, picture, "--picture", format="png", suffix="_error")
     refuse_existing([*coloured.values(), *pictures.values(), report], overwrite)
-    truth = io.read(clean, format=format_of(clean, format)) if clean else None
-    clean_points = truth.points[truth.finite] if truth else None
+    clean_points = points_to_compare(clean, format) if clean else None
     measuring = _Measuring(clean_points, load_mesh(mesh) if mesh else None, format, coloured, pictures, overwrite)
     batch = Batch(Console(quiet))
     batch.run([Job(source, STREAM) for source in sources], measuring.measure)
-    print(_as_text(batch.records))
+    if outputs.n_failed(batch.records) < len(sources):
+        print(_as_text(batch.records))
     if report:
         settings = {"clean": clean and str(clean), "mesh": mesh and str(mesh)}
         page = measuring.pages[0] if len(batch.records) == len(measuring.pages) == 1 else None
         outputs.save_report(report, "eval-chamfer", settings, batch.records, page, overwrite=overwrite)
     batch.close()
+
+
+def points_to_compare(path: Path, format: str | None) -> Points:
+    """(N, 3) points of a file, without those that have no coordinates. Raises ScanError if they are too few for any metric."""
+    from pcdenoise import io
+
+    scan = io.read(path, format=format_of(path, format))
+    points = scan.points[scan.finite]
+    if len(points) < 2:
+        raise ScanError(f"{path}: has {counted(len(points), 'point')} with coordinates, and errors need two; check what wrote it")
+    return points
 
 
 @dataclass(frozen=True)
@@ -88,8 +98,7 @@ class _Measuring:
         from pcdenoise.evaluation.raster import colour_map
         from pcdenoise.evaluation.report import Page
 
-        scan = io.read(job.source, format=format_of(job.source, self.format))
-        points = scan.points[scan.finite]
+        points = points_to_compare(job.source, self.format)
         metrics = evaluate(points, self.clean, self.mesh)
         errors = Scalar(point_errors(points, self.clean, self.mesh), "Distance to the truth")
         chart = histogram(errors.values, title="Errors", label=errors.label)

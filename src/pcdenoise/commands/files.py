@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pcdenoise.errors import ScanError, UsageError
+from pcdenoise.errors import ScanError, UsageError, not_a_folder
 
 if TYPE_CHECKING:
     from pcdenoise.cloud.scan import Scan
@@ -96,27 +96,40 @@ def shard(sources: Sequence[Path], text: str) -> list[Path]:
 
 
 def plan(
-    sources: Sequence[Path], output: str, *, suffix: str = "", format: str | None = None, share: Collection[Path] | None = None
+    sources: Sequence[Path],
+    output: str,
+    *,
+    suffix: str = "",
+    format: str | None = None,
+    share: Collection[Path] | None = None,
+    option: str = "-o",
 ) -> list[Job]:
     """One target for each source: the output itself for one source, a file of the same name in the output folder for several.
 
     suffix goes between name and extension; format, where given, sets the extension. share: the sources that are wanted, where
-    others see to the rest. Raises UsageError if two results, of whatever share, would meet in one file, or several in what is
-    not a folder.
+    others see to the rest; option: the one that names the output. Raises UsageError if two results, of whatever share, would
+    meet in one file, or several in what is not a folder.
     """
     wanted = set(sources if share is None else share)
     folder = output.endswith(("/", "\\")) or Path(output).is_dir()
     if not folder:
         if len(sources) > 1:
-            raise UsageError(f"-o {output}: {len(sources)} inputs need a folder; end the name with a slash: -o {output}/")
+            fix = f"end the name with a slash: {option} {output}/"
+            raise UsageError(f"{option} {output}: {len(sources)} inputs need a folder; {fix}")
         return [Job(source, Path(output)) for source in sources if source in wanted]
-    jobs = [Job(source, Path(output) / _target_name(source, suffix, format)) for source in sources]
+    jobs = [Job(source, Path(output) / target_name(source, suffix, format)) for source in sources]
     by_target: dict[Path, Path] = {}
     for job in jobs:
         other = by_target.setdefault(job.target, job.source)
         if other != job.source:
-            raise UsageError(f"-o {output}: {other} and {job.source} would both become {job.target}; clean them into two folders")
+            raise UsageError(f"{option} {output}: {other} and {job.source} would both become {job.target}; use two folders")
     return [job for job in jobs if job.source in wanted]
+
+
+def beside(sources: Sequence[Path], output: str, option: str, *, format: str | None = None, suffix: str) -> dict[Path, Path]:
+    """Where what an option adds to each source's result goes, as `plan` says; nowhere if the option was not given."""
+    jobs = plan(sources, output, suffix=suffix, format=format, option=option) if output else []
+    return {job.source: job.target for job in jobs}
 
 
 def absolute(jobs: Sequence[Job]) -> list[Job]:
@@ -124,9 +137,16 @@ def absolute(jobs: Sequence[Job]) -> list[Job]:
     return [Job(job.source.absolute(), job.target.absolute()) for job in jobs]
 
 
-def _target_name(source: Path, suffix: str, format: str | None) -> str:
-    stem, extension = ("stdin", "") if source == STREAM else (source.stem, source.suffix)
+def target_name(source: Path, suffix: str = "", format: str | None = None, found: str = "") -> str:
+    """A source's name with a suffix before its extension, or before that of a format; found: the format that stdin had."""
+    stem, extension = ("stdin", f".{found}" if found else "") if source == STREAM else (source.stem, source.suffix)
     return f"{stem}{suffix}{'.' + format if format else extension}"
+
+
+def refuse_file(folder: Path) -> None:
+    """Raises ScanError before any work is done if a file stands where results need a folder."""
+    if folder.exists() and not folder.is_dir():
+        raise not_a_folder(str(folder))
 
 
 def refuse_existing(targets: Sequence[Path | None], overwrite: bool) -> None:

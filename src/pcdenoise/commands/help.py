@@ -1,4 +1,4 @@
-"""Typer's help without what it imports and pcdenoise's help never shows. Not here: what the help says.
+"""Typer's help without what it imports and pcdenoise's help never shows, in whole paragraphs. Not here: what the help says.
 
 `typer.rich_utils` imports Rich's Markdown and tracebacks, and with them Pygments and a Markdown parser, for settings that
 pcdenoise does not use: a third of the time that help takes (https://github.com/fastapi/typer/pull/1128 names it as left to do).
@@ -6,6 +6,7 @@ pcdenoise does not use: a third of the time that help takes (https://github.com/
 
 from __future__ import annotations
 
+import inspect
 import sys
 from contextlib import suppress
 from types import ModuleType
@@ -13,6 +14,11 @@ from types import ModuleType
 from typer import core
 
 _UNUSED = {"rich.markdown": "Markdown", "rich.traceback": "Traceback"}
+
+
+def paragraphs(docstring: str) -> str:
+    """A docstring with each paragraph in one line: where lines end is for the terminal to say, not for the source."""
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in inspect.cleandoc(docstring).split("\n\n"))
 
 
 def import_rich_help() -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pcdenoise.commands import options
 from pcdenoise.commands.batch import Batch, Figures
 from pcdenoise.commands.console import Console, facts, figure
-from pcdenoise.commands.files import Job, expand, format_of, plan, refuse_existing
+from pcdenoise.commands.files import Job, beside, expand, format_of, refuse_existing, target_name
 from pcdenoise.commands.options import option
 from pcdenoise.commands.survey import cost_text, survey
 
@@ -35,7 +35,7 @@ def info(
     noise_map: Annotated[
         str, option("--noise-map", metavar="OUT", help="Write the scan with a column noise: a file, or a folder for several.")
     ] = "",
-    format: options.Format = None,
+    format: options.FormatRead = None,
     as_json: options.Json = False,
     overwrite: options.Overwrite = False,
     config: options.Config = None,
@@ -50,27 +50,28 @@ def info(
 
     batch = Batch(Console())
     sources = expand(inputs)
-    pictures = {job.source: job.target for job in plan(sources, picture, suffix="_noise", format="png")} if picture else {}
-    maps = {job.source: job.target for job in plan(sources, noise_map, suffix="_noise")} if noise_map else {}
+    pictures = beside(sources, picture, "--picture", format="png", suffix="_noise")
+    maps = beside(sources, noise_map, "--noise-map", suffix="_noise")
     refuse_existing([*pictures.values(), *maps.values()], overwrite)
 
     def describe(job: Job) -> Figures:
         scan = io.read(job.source, format=format_of(job.source, format))
         found = survey(scan, seed=seed, threads=threads or -1)
-        if not as_json:
-            print(_as_text(job.source, found), end="\n\n" if len(jobs) > 1 else "\n")
         if job.source in {**pictures, **maps}:
             noise = _noise_of_rows(scan, seed, threads or -1)
             if target := pictures.get(job.source):
-                _draw(target, scan, noise, overwrite)
+                _draw(target, scan, noise, found["unit"], overwrite)
             if target := maps.get(job.source):
                 target.parent.mkdir(parents=True, exist_ok=True)
                 marked = scan.with_attributes(noise=noise.astype("f4"))
                 io.write(marked, target, format=format_of(target, format), overwrite=overwrite)
         return found
 
+    def show(job: Job, found: Figures) -> None:
+        print(_as_text(job.source, found), end="\n\n" if len(jobs) > 1 else "\n")
+
     jobs = [Job(source, source) for source in sources]
-    batch.run(jobs, describe)
+    batch.run(jobs, describe, show=None if as_json else show)
     if as_json:
         done = [{"input": record["input"], **record["figures"]} for record in batch.records if record["status"] == "done"]
         print(json.dumps(done, indent=2))
@@ -90,12 +91,17 @@ def _noise_of_rows(scan: Scan, seed: int, threads: int) -> NDArray[np.float64]:
     return values
 
 
-def _draw(path: Path, scan: Scan, noise: NDArray[np.float64], overwrite: bool) -> None:
+def _draw(path: Path, scan: Scan, noise: NDArray[np.float64], unit: str, overwrite: bool) -> None:
+    import numpy as np
+
     from pcdenoise.evaluation.colours import Scalar
     from pcdenoise.evaluation.pictures import render, write_png
 
+    label = f"Noise ({unit})" if unit else "Noise"
+    if np.isnan(noise[scan.finite]).any():
+        label += "; grey: no surface shows"
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_png(path, render(scan.points, colour=Scalar(noise, "Noise")), overwrite=overwrite)
+    write_png(path, render(scan.points, colour=Scalar(noise, label)), overwrite=overwrite)
 
 
 def _as_text(path: Path, found: dict[str, Any]) -> str:
@@ -155,4 +161,4 @@ def _noise(found: dict[str, Any]) -> str:
 def _suggestion(path: Path, found: dict[str, Any]) -> str:
     if not found.get("is_surface"):
         return "nothing to clean: denoise would leave these points where they are"
-    return f"pcdenoise denoise {shlex.quote(str(path))} -o {shlex.quote(f'{path.stem}_clean{path.suffix}')}"
+    return f"pcdenoise denoise {shlex.quote(str(path))} -o {shlex.quote(target_name(path, '_clean', found=found['format']))}"

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pcdenoise.commands import options, outputs
-from pcdenoise.commands.cleaning import chosen_model
-from pcdenoise.commands.console import Console, figure, table
+from pcdenoise.commands.cleaning import chosen_model, named_model
+from pcdenoise.commands.console import Console, counted, figure, table
 from pcdenoise.commands.denoise import Iters, Method, Neighbours, Noise, Radius, SigmaD, SigmaN, Unshrink
-from pcdenoise.commands.files import format_of, refuse_existing
+from pcdenoise.commands.eval_chamfer import points_to_compare
+from pcdenoise.commands.files import format_of, refuse_existing, refuse_file, target_name
 from pcdenoise.commands.options import argument, configured, option
 
 if TYPE_CHECKING:
@@ -55,23 +56,33 @@ def iterate(
         sigma_d=sigma_d, sigma_n=sigma_n, seed=seed, threads=threads,
     )  # fmt: skip
     strip, report = output / "passes.png", output / "report.html"
+    refuse_file(output)
     refuse_existing([strip, report], overwrite)
     scan = io.read(source, format=format_of(source, format))
-    truth = _Truth(_finite(io.read(clean)) if clean else None, load_mesh(mesh) if mesh else None)
+
+    def target(number: int) -> Path:
+        return output / target_name(source, f"_{number}", format, scan.format)
+
+    refuse_existing([] if settings.iters == "auto" else [target(1 + number) for number in range(settings.iters)], overwrite)
+    truth = _Truth(points_to_compare(clean, format) if clean else None, load_mesh(mesh) if mesh else None)
     weights = chosen_model(model, settings)
-    output.mkdir(parents=True, exist_ok=True)
+    named = {**settings.model_dump(mode="json"), **named_model(weights)}
     passes = [_Pass(scan.points, truth.errors(scan.points))]
     with Console(quiet).progress(source.name) as on_progress:
         for number, step in enumerate(denoiser.iterate(scan.points, weights, settings), start=1):
             on_progress(f"pass {number}", 0.0 if settings.iters == "auto" else number / settings.iters)
-            target = output / f"{source.stem}_{number}{source.suffix}"
-            io.write(scan.moved_to(step.points), target, format=format_of(target, format), overwrite=overwrite)
+            output.mkdir(parents=True, exist_ok=True)
+            io.write(
+                scan.moved_to(step.points), target(number), format=format_of(target(number), format), overwrite=overwrite,
+                provenance=outputs.provenance("iterate", {**named, "pass": number}),
+            )  # fmt: skip
             figures = {name: value for name, value in step.figures.items() if name != "iteration"}
             passes.append(_Pass(step.points, {**figures, **truth.errors(step.points)}))
+    output.mkdir(parents=True, exist_ok=True)  # a scan without a surface has no pass
     print(_as_text(passes))
     _save_strip(strip, scan, passes, overwrite)
-    _save_report(report, scan, passes, settings.model_dump(mode="json"), overwrite)
-    Console(quiet).note(f"{output}: {len(passes) - 1} passes, {strip.name}, {report.name}")
+    _save_report(report, scan, passes, named, overwrite)
+    Console(quiet).note(f"{output}: {counted(len(passes) - 1, 'pass', 'passes')}, {strip.name}, {report.name}")
 
 
 @dataclass(frozen=True)

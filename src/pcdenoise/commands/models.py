@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -23,14 +22,16 @@ def models(
     """List the models that ship, or print one's card: training data, noise, scores, licence."""
     from pcdenoise.networks import store
 
-    found = list(store.available())
     if name is not None:
-        chosen = next((model for model in found if model.name == name), None) or store.info(Path(name))
-        print((chosen.path / store.CARD).read_text(encoding="utf-8").strip())
+        chosen = store.info(store.find(name))
+        card = (chosen.path / store.CARD).read_text(encoding="utf-8").strip()
+        print(json.dumps({**_as_json(chosen), "card": card}, indent=2) if as_json else card)
     elif as_json:
-        print(json.dumps([_as_json(model) for model in found], indent=2))
+        print(json.dumps([_as_json(model) for model in store.available()], indent=2))
     else:
-        rows = [[model.name, f"{model.n_parameters:,}", model.config.network, model.config.summary] for model in found]
+        rows = [
+            [model.name, f"{model.n_parameters:,}", model.config.network, model.config.summary] for model in store.available()
+        ]
         print(table(["model", "parameters", "network", "what"], rows, left={0, 2, 3}))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
+from typer.core import TyperCommand
 from typer.main import get_command
 
 from pcdenoise.errors import UsageError
@@ -26,6 +28,35 @@ _LARGEST_CONFIG = 1 << 20
 option = partial(typer.Option, show_envvar=False)
 common = partial(option, rich_help_panel="Common")
 argument = partial(typer.Argument, show_envvar=False)
+
+
+class Command(TyperCommand):
+    """A command that names the config file where a value that it refuses came from there."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """As Typer does. Raises UsageError for a value of the config file that is not of its option's type."""
+        try:
+            return super().parse_args(ctx, args)
+        except typer.BadParameter as fault:
+            if fault.param is None or not _is_from_config(ctx, fault.param.name):
+                raise
+            said = fault.format_message().rstrip(".")
+            raise UsageError(f"{ctx.params['config']}: {said[0].lower()}{said[1:]}; correct it there") from None
+
+    def invoke(self, ctx: Any) -> Any:
+        """As Typer does, where messages about an option's value start with the option."""
+        try:
+            return super().invoke(ctx)
+        except UsageError as fault:
+            flag = re.match(r"--([a-z][a-z-]*)", str(fault))
+            if flag is None or not _is_from_config(ctx, _identifier(flag[1])):
+                raise
+            raise UsageError(f"{ctx.params['config']}: {fault}") from None
+
+
+def _is_from_config(context: typer.Context, name: str | None) -> bool:
+    source = context.get_parameter_source(name or "")
+    return source is not None and source.name == "DEFAULT_MAP"
 
 
 def _apply_config(context: typer.Context, path: Path | None) -> Path | None:
@@ -67,15 +98,17 @@ def _defaults_from(path: Path, context: typer.Context) -> dict[str, Any]:
             if key not in options[table]:
                 raise UsageError(f"{path}: {table} has no option {_flag(key)}; see pcdenoise {table} --help")
     called = str(context.command.name)
-    known = options[called]
+    takes_many = {p.name: p.nargs == -1 or getattr(p, "multiple", False) for p in context.command.params}
     merged = {**everywhere, **tables.get(called, {})}
-    return {key: _as_typed_on_a_command_line(value) for key, value in merged.items() if key in known}
+    return {key: _as_typed(value, takes_many[key]) for key, value in merged.items() if key in options[called]}
 
 
-def _as_typed_on_a_command_line(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_as_typed_on_a_command_line(item) for item in value]
-    return value if isinstance(value, bool) else str(value)
+def _as_typed(value: Any, takes_many: bool) -> Any:
+    """A value as it stands on a command line: a list for what may be given several times, else with commas between."""
+    if isinstance(value, bool):
+        return value
+    words = [str(item) for item in value] if isinstance(value, list) else [str(value)]
+    return words if takes_many else ",".join(words)
 
 
 def _identifier(key: str) -> str:
@@ -98,7 +131,7 @@ def configured(model: type[ConfigModel], **values: Any) -> ConfigModel:
         return model(**values)
     except ValidationError as error:
         first = error.errors()[0]
-        name = _flag(str(first["loc"][0])) if first["loc"] else "options"
+        name = _flag(str(first["loc"][0]).removesuffix("_s")) if first["loc"] else "options"  # of budget_s, which is --budget
         message = first["msg"].removeprefix("Value error, ")
         message = f"{message[0].lower()}{message[1:]}".replace("input should be", "must be")
         raise UsageError(f"{name}: {message}, got {first['input']!r}") from None
@@ -127,10 +160,12 @@ Config = Annotated[
     Path | None,
     common("--config", is_eager=True, callback=_apply_config, metavar="FILE", help="TOML file with values for any options."),
 ]
-Format = Annotated[
-    Literal["las", "laz", "ply", "xyz", "pcd", "bin"] | None,
-    option("--format", help="Format of - and of files without a known suffix; into a folder: convert to it."),
-]
+OneOutput = Annotated[str, option("--output", "-o", metavar="OUT", help="A file, or - for stdout.")]
+_Formats = Literal["las", "laz", "ply", "xyz", "pcd", "bin"]
+_OF_NAMELESS = "Format of - and of files without a known suffix"
+Format = Annotated[_Formats | None, option("--format", help=f"{_OF_NAMELESS}; into a folder: convert to it.")]
+FormatRead = Annotated[_Formats | None, option("--format", help=f"{_OF_NAMELESS}.")]
+"""For commands that write no scan, or one file."""
 Model = Annotated[
     str | None, option("--model", metavar="NAME|DIR", help="A shipped model (see pcdenoise models) or a model folder.")
 ]

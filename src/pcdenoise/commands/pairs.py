@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from pcdenoise.commands import options
-from pcdenoise.commands.console import Console
-from pcdenoise.commands.files import expand, format_of, refuse_existing
+from pcdenoise.commands.batch import Batch, Figures
+from pcdenoise.commands.console import Console, counted
+from pcdenoise.commands.files import Job, expand, format_of, plan, refuse_existing, refuse_file, target_name
 from pcdenoise.commands.options import option
 from pcdenoise.errors import UsageError
 
@@ -25,7 +26,7 @@ def pairs(
     to: Annotated[
         Literal["npz", "ply", "xyz"], option("--to", help="npz: arrays noisy and clean in one file; else a file for each cloud.")
     ] = "npz",
-    format: options.Format = None,
+    format: options.FormatRead = None,
     overwrite: options.Overwrite = False,
     config: options.Config = None,
     seed: options.Seed = 0,
@@ -47,30 +48,36 @@ def pairs(
     from pcdenoise.learning.scans import colours_of
     from pcdenoise.learning.upgrade import prior_for, pseudo_clean
 
-    output.mkdir(parents=True, exist_ok=True)
+    refuse_file(output)
     console = Console(quiet)
-    for number, source in enumerate(expand(inputs)):
-        scan = io.read(source, format=format_of(source, format))
+    jobs = plan(expand(inputs), f"{output}/", format=to)
+
+    def draw_from(job: Job) -> Figures:
+        scan = io.read(job.source, format=format_of(job.source, format))
         points = scan.points[scan.finite]
         colours = colours_of(scan)[scan.finite] if prior == "full" else None
         if len(points) < 2:
-            raise UsageError(f"{source}: has {len(points)} points; a pair needs neighbours")
+            raise UsageError(f"{job.source}: has {counted(len(points), 'point')}; a pair needs neighbours")
         chosen = prior_for(points, radius)
-        names = [output / f"{source.stem}_{draw:04d}" for draw in range(1, draws + 1)]
-        if to == "npz":
-            targets = [name.with_name(f"{name.name}.npz") for name in names]
-        else:
-            targets = [name.with_name(f"{name.name}_clean.{to}") for name in names]
-            targets.append(output / f"{source.stem}_noisy.{to}")
-        refuse_existing(targets, overwrite)
-        for draw in range(draws):
-            clean = pseudo_clean(points, colours, prior=chosen, rng=np.random.default_rng([seed, number, draw]))
+        kind = "" if to == "npz" else "_clean"
+        targets = [output / target_name(job.source, f"_{draw:04d}{kind}", to) for draw in range(1, draws + 1)]
+        noisy = [] if to == "npz" else [output / target_name(job.source, "_noisy", to)]
+        refuse_existing([*targets, *noisy], overwrite)
+        output.mkdir(parents=True, exist_ok=True)
+        for draw, target in enumerate(targets):
+            rng = np.random.default_rng([seed, jobs.index(job), draw])
+            clean = pseudo_clean(points, colours, prior=chosen, rng=rng)
             if to == "npz":
                 memory = BytesIO()
                 np.savez(memory, noisy=points, clean=clean)
-                write_whole(targets[draw], memory.getvalue(), overwrite=overwrite)
+                write_whole(target, memory.getvalue(), overwrite=overwrite)
             else:
-                io.write(Scan(clean, format=to), targets[draw], overwrite=overwrite)
-        if to != "npz":
-            io.write(Scan(points, format=to), targets[-1], overwrite=overwrite)
-        console.note(f"{output}: {draws} pairs of {len(points):,} points from {source}")
+                io.write(Scan(clean, format=to), target, overwrite=overwrite)
+        for target in noisy:
+            io.write(Scan(points, format=to), target, overwrite=overwrite)
+        console.note(f"{output}: {counted(draws, 'pair')} of {counted(len(points), 'point')} from {job.source}")
+        return {"points": len(points), "pairs": draws}
+
+    batch = Batch(console)
+    batch.run(jobs, draw_from)
+    batch.close()

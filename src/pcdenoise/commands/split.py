@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Annotated
 
 from pcdenoise.commands import options
-from pcdenoise.commands.console import Console
-from pcdenoise.commands.files import expand, format_of, refuse_existing
+from pcdenoise.commands.batch import Batch, Figures
+from pcdenoise.commands.console import Console, counted
+from pcdenoise.commands.files import Job, expand, format_of, plan, refuse_existing, refuse_file, target_name
 from pcdenoise.commands.options import option
 
 
@@ -31,17 +32,24 @@ def split(
     from pcdenoise import io
     from pcdenoise.cloud.neighbours import parts
 
+    refuse_file(output)
     console = Console(quiet)
-    output.mkdir(parents=True, exist_ok=True)
-    for source in expand(inputs):
-        scan = io.read(source, format=format_of(source, format))
+
+    def cut(job: Job) -> Figures:
+        scan = io.read(job.source, format=format_of(job.source, format))
         rows = np.flatnonzero(scan.finite)
         pieces = [rows[piece] for piece in parts(scan.points[rows], points)]
-        suffix = f".{format}" if format else source.suffix
-        targets = [output / f"{source.stem}_{number:04d}{suffix}" for number in range(1, len(pieces) + 1)]
+        numbers = range(1, len(pieces) + 1)
+        targets = [output / target_name(job.source, f"_{number:04d}", format, scan.format) for number in numbers]
         refuse_existing(targets, overwrite)
+        output.mkdir(parents=True, exist_ok=True)
         for piece, target in zip(pieces, targets, strict=True):
             chosen = np.zeros(len(scan), dtype=bool)
             chosen[piece] = True
             io.write(io.select(scan, chosen), target, format=format_of(target, format), overwrite=overwrite)
-        console.note(f"{output}: {len(scan):,} points of {source} in {len(pieces)} parts")
+        console.note(f"{output}: {counted(len(scan), 'point')} of {job.source} in {counted(len(pieces), 'part')}")
+        return {"points": len(scan), "parts": len(pieces)}
+
+    batch = Batch(console)
+    batch.run(plan(expand(inputs), f"{output}/", format=format), cut)
+    batch.close()

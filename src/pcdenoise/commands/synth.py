@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pcdenoise.commands import options
-from pcdenoise.commands.console import Console
+from pcdenoise.commands.console import Console, counted
 from pcdenoise.commands.files import refuse_existing
 from pcdenoise.commands.options import argument, option
 from pcdenoise.errors import ScanError, UsageError
@@ -68,7 +68,7 @@ def synth(
     settings = {"points": points, "levels_percent_of_diagonal": percents, "noise": noise, "seed": seed}
     document = {"schema": 1, **settings, "items": items}
     write_whole(index, json.dumps(document, indent=2).encode() + b"\n", overwrite=overwrite)
-    console.note(f"{output}: {len(items)} surfaces, {len(percents)} noisy clouds each; see {index}")
+    console.note(f"{output}: {counted(len(items), 'surface')}, {counted(len(percents), 'noisy cloud')} each; see {index}")
 
 
 @dataclass(frozen=True)

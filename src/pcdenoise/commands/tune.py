@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from pcdenoise.commands import options
-from pcdenoise.commands.console import Console
+from pcdenoise.commands.console import Console, counted
 from pcdenoise.commands.files import refuse_existing
 from pcdenoise.commands.options import argument, option
-from pcdenoise.errors import UsageError
+from pcdenoise.errors import ScanError, UsageError
 
 
 def tune(
@@ -34,11 +34,14 @@ def tune(
     from pcdenoise.learning.scans import noisy_and_clean
 
     refuse_existing([output], overwrite)
+    for path in data:
+        if not path.exists():
+            raise ScanError(f"{path}: no such file or folder; check the path")
     pairs = list(noisy_and_clean(data))
     if not pairs:
         raise UsageError(f"{', '.join(map(str, data))}: no noisy cloud with a clean one; give folders made by pcdenoise synth")
     with Console(quiet).progress("tune") as on_progress:
-        on_progress(f"{method}, {len(pairs)} clouds", 0.0)
+        on_progress(f"{method}, {counted(len(pairs), 'cloud')}", 0.0)
         found = classical.tune(pairs, method, threads=threads or -1)
     named = {"neighbours" if name == "k" else name: value for name, value in found.items()}
     lines = ["[denoise]", f'method = "{method}"', *(f"{name} = {value:.6g}" for name, value in named.items())]
@@ -47,4 +50,6 @@ def tune(
         print(text, end="")
     else:
         write_whole(output, text.encode(), overwrite=overwrite)
-        Console(quiet).note(f"{output}: {', '.join(lines[2:]) or 'the automatic choice is best'}, from {len(pairs)} clouds")
+        Console(quiet).note(
+            f"{output}: {', '.join(lines[2:]) or 'the automatic choice is best'}, from {counted(len(pairs), 'cloud')}"
+        )

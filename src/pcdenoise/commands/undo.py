@@ -34,15 +34,15 @@ _AFTERWARDS = (UNCERTAINTY, OUTLIER)
 
 def undo(
     clean: Annotated[Path, typer.Argument(metavar="CLEAN", help="A scan written with --displacement.")],
-    output: options.Output,
-    format: options.Format = None,
+    output: options.OneOutput,
+    format: options.FormatRead = None,
     overwrite: options.Overwrite = False,
     config: options.Config = None,
 ) -> None:
     """Take a cleaned scan back to the original, exactly; needs a scan written by denoise --displacement.
 
     The columns that it added and the note on how it was made go too: a LAS, binary PLY or binary PCD is the original byte for
-    byte. Compressed files hold the same and may be packed otherwise; a number in a text may lose zeros at its end.
+    byte. Compressed files hold the same and may be packed otherwise; a number in a text may gain zeros at its end.
 
     Example: pcdenoise undo clean.laz -o original.laz
     """

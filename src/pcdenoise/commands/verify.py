@@ -28,9 +28,11 @@ MaxDrift = Annotated[
 def verify(
     before: Annotated[Path, typer.Argument(metavar="BEFORE", help="The scan that went in.")],
     after: Annotated[Path, typer.Argument(metavar="AFTER", help="The scan that came out.")],
-    max_move: Annotated[float | None, option("--max-move", help="Fail if a point moved farther, in the file's unit.")] = None,
+    max_move: Annotated[
+        float | None, option("--max-move", min=0, help="Fail if a point moved farther, in the file's unit.")
+    ] = None,
     max_drift: MaxDrift = None,
-    format: options.Format = None,
+    format: options.FormatRead = None,
     as_json: options.Json = False,
     config: options.Config = None,
 ) -> None:

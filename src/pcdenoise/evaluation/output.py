@@ -13,7 +13,7 @@ def write_whole(path: str | os.PathLike[str], data: bytes, *, overwrite: bool) -
     """Write the bytes to `path`. Raises ScanError if that fails or would overwrite unasked."""
     target = Path(path)
     if target.exists() and not overwrite:
-        raise ScanError(f"{path}: exists already; choose another name or allow overwriting")
+        raise ScanError(f"{path}: exists already; choose another name or allow overwriting (--overwrite)")
     try:
         with replaced(target) as file:
             file.write(data)

@@ -239,7 +239,8 @@ def _figure(name: str, image: Image) -> str:
 def _table(values: Mapping[str, Any]) -> str:
     """Two columns; what is nested is listed under its own names joined with the outer one."""
     rows = "".join(
-        f'<tr><th scope="row">{_name(key)}</th><td>{_cell(value)}</td></tr>' for key, value in _flat(plain(values)).items()
+        f'<tr><th scope="row">{_name(key)}</th><td{_kind(_is_number(value))}>{_cell(value)}</td></tr>'
+        for key, value in _flat(plain(values)).items()
     )
     return f'<table class="pairs"><tbody>{rows}</tbody></table>'
 
@@ -248,10 +249,15 @@ def _grid(rows: Sequence[Mapping[str, Any]]) -> str:
     flat = [_flat(plain(row)) for row in rows]
     columns = list(dict.fromkeys(key for row in flat for key in row))
     numeric = {key for key in columns if any(_is_number(row.get(key)) for row in flat)}
-    kinds = {key: ' class="number"' if key in numeric else "" for key in columns}
+    kinds = {key: _kind(key in numeric) for key in columns}
     head = "".join(f'<th scope="col"{kinds[key]}>{_name(key)}</th>' for key in columns)
     body = "".join("<tr>" + "".join(f"<td{kinds[key]}>{_cell(row.get(key))}</td>" for key in columns) + "</tr>" for row in flat)
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _kind(is_number: bool) -> str:
+    """The class of a cell that stands to the right and is not broken."""
+    return ' class="number"' if is_number else ""
 
 
 def in_words(key: str) -> str:

@@ -51,7 +51,9 @@ def read(path: str | os.PathLike[str], *, format: str | None = None) -> Scan:
     found = _sniffed(raw[:_HEAD])
     if named != "bin" and not (found and _MODULES[named or found] is _MODULES[found]):
         content = {"xyz": "text", "": "of no known format"}.get(found, found)
-        raise ScanError(f"{origin}: is taken for {named or 'a scan'} but its content is {content}; rename it or name its format")
+        raise ScanError(
+            f"{origin}: is taken for {named or 'a scan'} but its content is {content}; rename it or name its format (--format)"
+        )
     scan: Scan = _MODULES[named or found].read(raw, origin)
     return scan
 
@@ -73,18 +75,24 @@ def write(
     """
     target = os.fspath(path)
     if format is None and target == files.STREAM:
-        raise ScanError("stdout: has no suffix to tell the format by; name the format")
+        raise ScanError("stdout: has no suffix to tell the format by; name the format (--format)")
     named = _known(format or _by_suffix(path))
     if target.lower().endswith(".copc.laz"):
         raise ScanError(f"{target}: rows stay in order, so no COPC octree is written; name the file .laz without .copc")
-    lost = losses(scan, named)
-    if lost and not drop_attributes:
-        raise ScanError(f"{target}: {named} would drop {', '.join(lost)}; allow dropping attributes or write .{scan.format}")
+    if not drop_attributes:
+        refuse_losses(scan, path, named)
     with files.written(path, overwrite=overwrite) as file:
         try:
             _encode(scan, file, named, Path(target).suffix.lower(), provenance)
         except ScanError as fault:
             raise ScanError(f"{target}: {fault}") from None
+
+
+def refuse_losses(scan: Scan, path: str | os.PathLike[str], format: str) -> None:
+    """Raises ScanError if writing the scan in a format would drop something."""
+    if lost := losses(scan, format):
+        fix = f"allow dropping attributes (--drop-attributes) or write .{scan.format}"
+        raise ScanError(f"{os.fspath(path)}: {format} would drop {', '.join(lost)}; {fix}")
 
 
 class Stream(Protocol):
@@ -176,18 +184,8 @@ def coordinate_system(scan: Scan) -> Crs | None:
 
 
 def coordinate_step(scan: Scan) -> float | None:
-    """The step between coordinates that the file can hold: the scale of a LAS, the decimals of a text; None if there is none.
-
-    Apart from LAS it is told from up to 10 000 rows: the largest power of ten, 1 to 1e-8, that all coordinates are multiples of.
-    """
-    if isinstance(scan.source, las.LasSource):
-        return float(np.abs(scan.source.file.field("scale")).max())
-    some = scan.points[scan.finite][:: max(1, len(scan) // 10_000)]
-    for decimals in range(9) if len(some) else ():
-        scaled = some * 10.0**decimals
-        if (np.abs(scaled - np.rint(scaled)) <= 1e-6 + 8 * np.finfo(np.float64).eps * np.abs(scaled)).all():
-            return float(10.0**-decimals)
-    return None
+    """What the file rounds moved coordinates to: the scale of a LAS, else None: text gets the decimals that it needs."""
+    return float(np.abs(scan.source.file.field("scale")).max()) if isinstance(scan.source, las.LasSource) else None
 
 
 def without(scan: Scan, names: Collection[str]) -> Scan:
@@ -232,9 +230,8 @@ def _known(format: str) -> str:
 def _by_suffix(path: str | os.PathLike[str]) -> str:
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
-        raise ScanError(
-            f"{os.fspath(path)}: no suffix tells its format; name the format, or use one of {' '.join(sorted(SUFFIXES))}"
-        )
+        fix = f"name the format (--format), or use one of {' '.join(sorted(SUFFIXES))}"
+        raise ScanError(f"{os.fspath(path)}: no suffix tells its format; {fix}")
     return SUFFIXES[suffix]
 
 

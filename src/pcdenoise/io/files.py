@@ -121,7 +121,7 @@ def _check_target(path: str | os.PathLike[str], target: Path, overwrite: bool) -
     if not target.parent.is_dir():
         raise ScanError(f"{path}: folder {target.parent} does not exist; create it first")
     if target.exists() and not overwrite:
-        raise ScanError(f"{path}: exists already; choose another name or allow overwriting")
+        raise ScanError(f"{path}: exists already; choose another name or allow overwriting (--overwrite)")
 
 
 @contextmanager

@@ -197,11 +197,18 @@ def _array(body: bytes, header: Header, origin: str) -> NDArray[Any]:
 
 def _decompressed(body: bytes, header: Header, origin: str) -> tuple[NDArray[Any], bytes, bytes]:
     """Records, packed block and bytes after it of a binary_compressed body, which holds field after field."""
-    size, full_size = _SIZES.unpack_from(body) if len(body) >= _SIZES.size else (0, 0)
+    if len(body) < _SIZES.size:
+        raise ScanError(f"{origin}: ends before its points; it is cut off, fetch it again")
+    size, full_size = _SIZES.unpack_from(body)
     end = _SIZES.size + size
     expected = header.n_points * header.dtype.itemsize
-    if end > len(body) or full_size != expected or full_size > lzf.LARGEST_RATIO * size:
+    if full_size != expected:
         raise ScanError(f"{origin}: header claims {expected} bytes of points, the file packs {full_size}; fetch it again")
+    if end > len(body):
+        held = len(body) - _SIZES.size
+        raise ScanError(f"{origin}: {size} bytes of packed points are claimed, {held} are there; it is cut off, fetch it again")
+    if full_size > lzf.LARGEST_RATIO * size:
+        raise ScanError(f"{origin}: {full_size} bytes of points cannot be packed in {size}; it is damaged, fetch it again")
     try:
         plain = lzf.decompress(body[_SIZES.size : end], full_size)
     except ValueError as fault:

@@ -132,7 +132,7 @@ def info(folder: Path) -> ModelInfo:
 
 def load(name_or_folder: str | Path = DEFAULT) -> Model:
     """The model in that folder, or of that name among the shipped ones. Raises ModelError when missing, damaged or tampered."""
-    folder = _find(name_or_folder)
+    folder = find(name_or_folder)
     config = _read_config(folder)
     data = _read(folder / WEIGHTS)
     return Model(folder.name, config, hashlib.sha256(data).hexdigest(), _parsed(data, config, folder / WEIGHTS))
@@ -186,7 +186,8 @@ def save(
         raise ModelError(f"{folder}: cannot be saved ({fault.strerror}); check permissions and free space") from None
 
 
-def _find(name_or_folder: str | Path) -> Path:
+def find(name_or_folder: str | Path) -> Path:
+    """The folder of a model, or of a shipped one by its name. Raises ModelError if there is none."""
     folder = Path(name_or_folder)
     if (folder / CONFIG).is_file():
         return folder
