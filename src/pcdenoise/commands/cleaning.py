@@ -135,6 +135,7 @@ class Cleaning:
             if stream is not None and (self.tile or self._is_too_large(stream)):
                 self._refuse_cells(job, stream)
         scan = io.read(job.source, format=format_of(job.source, self.format))
+        refuse_taken(scan, self._adding)
         self.selection.masks(scan)
         written = format_of(job.target, self.format) or io.SUFFIXES.get(job.target.suffix.lower())
         if written and not self.drop_attributes:
