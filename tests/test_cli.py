@@ -333,6 +333,15 @@ def test_a_column_that_is_there_already_is_not_written_over(
     assert not second.exists()
 
 
+@pytest.mark.parametrize("format", ["xyz", "ply", "pcd", "las"])
+def test_a_limit_that_binds_is_kept_but_for_the_rounding_of_the_file(format: str, sphere: Path) -> None:
+    original, clean = (sphere.with_name(f"{name}.{format}") for name in ("original", "clean"))
+    pcdenoise.write(pcdenoise.read(sphere), original)
+    assert main(["denoise", str(original), "-o", str(clean), "--max-move", "0.005", "-q", *FAST]) == 0
+    assert main(["verify", str(original), str(clean), "--max-move", "0.005"]) == 0
+    assert main(["verify", str(original), str(clean), "--max-move", "0.0048"]) == 5
+
+
 def test_undo_takes_away_only_what_came_with_the_places(sphere: Path) -> None:
     once, twice, back = (sphere.with_name(f"{name}.ply") for name in ("once", "twice", "back"))
     assert main(["denoise", str(sphere), "-o", str(once), "--uncertainty", "-q", *FAST]) == 0

@@ -29,7 +29,7 @@ def verify(
     before: Annotated[Path, typer.Argument(metavar="BEFORE", help="The scan that went in.")],
     after: Annotated[Path, typer.Argument(metavar="AFTER", help="The scan that came out.")],
     max_move: Annotated[
-        float | None, option("--max-move", min=0, help="Fail if a point moved farther, in the file's unit.")
+        float | None, option("--max-move", min=0, help="Fail if a point moved farther, in the file's unit, rounding apart.")
     ] = None,
     max_drift: MaxDrift = None,
     format: options.FormatRead = None,
@@ -45,12 +45,13 @@ def verify(
     """
     from pcdenoise import io
 
-    findings = compare(io.read(before, format=format_of(before, format)), io.read(after, format=format_of(after, format)))
+    cleaned = io.read(after, format=format_of(after, format))
+    findings = compare(io.read(before, format=format_of(before, format)), cleaned)
     print(json.dumps(findings, indent=2) if as_json else _as_text(findings))
     if findings["lost"]:
         raise GateError(f"{after}: not everything of {before} survived: {'; '.join(findings['lost'])}")
-    if max_move is not None and findings["move"]["max"] > max_move:
-        raise GateError(f"{after}: a point moved by {figure(findings['move']['max'])}, the limit is {figure(max_move)}")
+    if max_move is not None and findings["move"]["max"] > max_move + io.rounding(cleaned):
+        raise GateError(f"{after}: a point moved by {findings['move']['max']:.6g}, the limit is {max_move:g}")
     if findings["drift"] is not None:
         check_drift(after, findings["drift"], findings["noise_before"], max_drift)
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from pcdenoise.cloud.scan import Mask, Scan
 from pcdenoise.errors import ScanError
-from pcdenoise.io import files, kitti, las, pcd, ply, xyz
+from pcdenoise.io import files, kitti, las, pcd, ply, text, xyz
 from pcdenoise.io.crs import Crs
 from pcdenoise.io.source import changed, portable
 
@@ -186,6 +186,20 @@ def coordinate_system(scan: Scan) -> Crs | None:
 def coordinate_step(scan: Scan) -> float | None:
     """What the file rounds moved coordinates to: the scale of a LAS, else None: text gets the decimals that it needs."""
     return float(np.abs(scan.source.file.field("scale")).max()) if isinstance(scan.source, las.LasSource) else None
+
+
+def rounding(scan: Scan) -> float:
+    """How far a point may lie from where it was to be written: half the file's step along each axis, in the file's unit."""
+    points = scan.points[scan.finite]
+    if not len(points):
+        return 0.0
+    largest = np.abs(points).max()
+    step = coordinate_step(scan) or 4 * float(np.spacing(largest))
+    if scan.format == "xyz":
+        step = text.COORDINATE_STEP * float(np.ptp(points, axis=0).max())
+    elif coordinate_step(scan) is None and (points == points.astype(np.float32)).all():
+        step = float(np.spacing(np.float32(largest)))
+    return 3**0.5 / 2 * step
 
 
 def without(scan: Scan, names: Collection[str]) -> Scan:

@@ -26,7 +26,7 @@ _BLOCK_BYTES = 4 << 20
 _BLOCK_ROWS = 1 << 16
 _LONGEST_NUMBER = 64
 _LONGEST_TEXT = 256
-_COORDINATE_STEP = 1e-6
+COORDINATE_STEP = 1e-6
 _PLAIN = np.array([byte in (9, LF, CR) or (BLANK <= byte < 127 and byte != QUOTE) for byte in range(256)])
 
 
@@ -275,7 +275,7 @@ def coordinates(rows: TextRows, column: ColumnIndex, before: Points, after: Colu
 
 def coordinate_form(before: Points, digits: int, exponent: bool) -> str:
     """The printf format of `coordinates`, for (N, 3) points of the extent and size of all and a column's decimals."""
-    needed = step_decimals(before, _COORDINATE_STEP)
+    needed = step_decimals(before, COORDINATE_STEP)
     if exponent:
         size = float(np.abs(before[np.isfinite(before)]).max(initial=1.0))
         return f"%.{min(max(digits, needed + int(np.ceil(np.log10(size)))), 17)}e"
