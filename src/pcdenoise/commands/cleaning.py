@@ -23,10 +23,12 @@ from pcdenoise.commands.verify import check_drift
 from pcdenoise.errors import ScanError, UsageError
 
 if TYPE_CHECKING:
-    from pcdenoise.cloud.scan import Scan
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from pcdenoise.cloud.scan import Mask, Scan
     from pcdenoise.config import DenoiseConfig
     from pcdenoise.denoising.denoiser import Result
-    from pcdenoise.denoising.tiles import Rows
     from pcdenoise.evaluation.report import Page
     from pcdenoise.io import Stream
     from pcdenoise.networks.store import Model
@@ -196,7 +198,10 @@ class Cleaning:
         with self.console.progress(job.source.name) as on_progress:
             tiles.run(on_progress)
             check_drift(job.target, tiles.figures["drift"], tiles.figures["noise"], self.max_drift)
-            pieces = (self._piece(scan, rows) for scan, rows in zip(read(), tiles.rows(), strict=True))
+            pieces = (
+                self._with_columns(scan, scan.moved_to(rows.points), rows.std, rows.outlier)
+                for scan, rows in zip(read(), tiles.rows(), strict=True)
+            )
             io.write_streamed(
                 stream, pieces, job.target, format=format_of(job.target, self.format), overwrite=self.overwrite,
                 provenance=outputs.provenance("denoise", self.settings),
@@ -205,15 +210,6 @@ class Cleaning:
         figures = {"points": stream.n_points, **tiles.figures, "seconds": round(time.perf_counter() - started, 3)}
         self.console.note(f"{job.target}: {_summary(figures)}")
         return figures
-
-    def _piece(self, scan: Scan, rows: Rows) -> Scan:
-        """Some rows moved, with the columns that were asked for."""
-        cleaned = scan.moved_to(rows.points)
-        if self.displacement:
-            cleaned = with_displacement(scan.points, cleaned)
-        if rows.std is not None:
-            cleaned = with_uncertainty(cleaned, rows.std)
-        return with_outliers(cleaned, rows.outlier) if self.config.outliers == "flag" else cleaned
 
     def _clean_whole(self, job: Job) -> Figures:
         from pcdenoise import io
@@ -235,7 +231,7 @@ class Cleaning:
         check_drift(job.target, result.figures["drift"], result.figures["noise"], self.max_drift)
         job.target.parent.mkdir(parents=True, exist_ok=True)
         io.write(
-            self._marked(scan, result), job.target, format=format_of(job.target, self.format), overwrite=self.overwrite,
+            self._written(scan, result), job.target, format=format_of(job.target, self.format), overwrite=self.overwrite,
             drop_attributes=self.drop_attributes, provenance=outputs.provenance("denoise", self.settings),
         )  # fmt: skip
         figures = {"points": len(scan), **result.figures, "seconds": round(time.perf_counter() - started, 3)}
@@ -253,20 +249,23 @@ class Cleaning:
         self.console.note(f"{job.target}: {_summary(figures)}" + (f"; picture {picture}" if picture else ""))
         return figures
 
-    def _marked(self, scan: Scan, result: Result) -> Scan:
-        """The moved scan with the columns that were asked for, without the rows that were not wanted."""
+    def _written(self, scan: Scan, result: Result) -> Scan:
+        """The moved scan as it is to be written: colours, further columns, without the rows that were not wanted."""
         from pcdenoise import io
 
         cleaned = scan.moved_to(result.points)
         if self.colour:
             cleaned = with_colours(scan, cleaned, undoable=self.displacement, threads=self.config.threads)
+        cleaned = self._with_columns(scan, cleaned, result.std, result.outlier)
+        return io.select(cleaned, ~result.outlier) if self.config.outliers == "remove" else cleaned
+
+    def _with_columns(self, scan: Scan, cleaned: Scan, std: NDArray[np.float64] | None, outlier: Mask) -> Scan:
+        """The cleaned scan, or some rows of it, with the columns that were asked for; `undo` relies on their order."""
         if self.displacement:
             cleaned = with_displacement(scan.points, cleaned)
-        if result.std is not None:
-            cleaned = with_uncertainty(cleaned, result.std)
-        if self.config.outliers == "flag":
-            cleaned = with_outliers(cleaned, result.outlier)
-        return io.select(cleaned, ~result.outlier) if self.config.outliers == "remove" else cleaned
+        if std is not None:
+            cleaned = with_uncertainty(cleaned, std)
+        return with_outliers(cleaned, outlier) if self.config.outliers == "flag" else cleaned
 
 
 def picture_notes(result: Result, unit: str) -> tuple[str, str]:
