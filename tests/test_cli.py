@@ -250,6 +250,13 @@ def test_a_flag_beats_the_environment_beats_the_file_beats_the_default(sphere: P
     assert strength_used(sphere, "--config", str(settings), "--strength", "0.75") == 0.75
 
 
+def test_a_config_file_speaks_of_json_as_the_command_line_does(sphere: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = sphere.with_name("settings.toml")
+    settings.write_text("[info]\njson = true\n")
+    assert main(["info", str(sphere), "--config", str(settings)]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["points"] == 3000
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

@@ -46,6 +46,14 @@ def test_training_clouds_depend_on_seed_and_number_alone(tmp_path):
     assert not np.array_equal(first.seeds[:10], sources[0].cloud(4, 24).seeds[:10])
 
 
+def test_several_processes_make_the_clouds_that_one_makes(tmp_path):
+    source = CloudSource([[partial(from_surface, load) for load in surfaces_from(["shapes:1"], 5, tmp_path)[0]]], 5)
+    series = source.clouds(2, 24, stride=3, n_makers=2)
+    for number in (2, 5, 8):
+        np.testing.assert_array_equal(next(series).seeds, source.cloud(number, 24).seeds)
+    series.close()
+
+
 def test_learning_from_one_cloud_lowers_its_error(surface):
     torch.manual_seed(0)
     cloud = draw_cloud(surface, 24, np.random.default_rng(2))

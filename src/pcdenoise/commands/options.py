@@ -112,11 +112,12 @@ def _as_typed(value: Any, takes_many: bool) -> Any:
 
 
 def _identifier(key: str) -> str:
-    return key.replace("-", "_")
+    """The parameter behind an option's name; `json` is a module where `as_json` is needed."""
+    return "as_json" if key == "json" else key.replace("-", "_")
 
 
 def _flag(name: str) -> str:
-    return "--" + name.replace("_", "-")
+    return "--json" if name == "as_json" else "--" + name.replace("_", "-")
 
 
 def _one_line(error: Exception) -> str:

@@ -5,6 +5,7 @@ Not here: where surfaces and scans come from (sources.py), losses, the training 
 
 from __future__ import annotations
 
+import os
 import re
 from abc import ABC, abstractmethod
 from collections import deque
@@ -45,6 +46,7 @@ _LAWS = {
 """How often each law of noise is met."""
 
 
+_PROCESSORS_PER_MAKER, _AHEAD = 4, 6
 _LIKELY_OTHERS = 6
 """Residuals come from any of so many samples: with the nearest alone neighbours would share one, and noise would look smaller."""
 
@@ -284,15 +286,17 @@ CloudT = TypeVar("CloudT")
 
 
 class CloudsAhead(ABC, Generic[CloudT]):
-    """An endless series of training clouds, made ahead of time by one other process."""
+    """An endless series of training clouds, made ahead of time by other processes."""
 
     @abstractmethod
     def cloud(self, number: int, neighbours: int) -> CloudT:
         """The number-th cloud; it depends on nothing but the source and these."""
 
-    def clouds(self, first: int, neighbours: int, ahead: int = 6, stride: int = 1) -> Iterator[CloudT]:
-        """Endless clouds from the first-th on, every stride-th."""
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as makers:
+    def clouds(self, first: int, neighbours: int, stride: int = 1, n_makers: int | None = None) -> Iterator[CloudT]:
+        """Endless clouds from the first-th on, every stride-th, from one process for every four processors if not given."""
+        n_makers = n_makers or max(1, (os.cpu_count() or 1) // _PROCESSORS_PER_MAKER)
+        ahead = _AHEAD * n_makers
+        with ProcessPoolExecutor(n_makers, mp_context=get_context("spawn")) as makers:
             waiting = deque(makers.submit(self.cloud, first + i * stride, neighbours) for i in range(ahead))
             try:
                 for number in count(first + ahead * stride, stride):

@@ -16,7 +16,7 @@ from pcdenoise.cloud.neighbours import knn, principal_axes
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising.denoiser import denoise
 from pcdenoise.learning.dataset import Array, Draw, Surface, from_surface
-from pcdenoise.learning.sources import NoisyClouds
+from pcdenoise.learning.sources import NoisyClouds, save_array
 from pcdenoise.networks import store
 
 _DISC_SPACINGS = 2.0
@@ -53,9 +53,7 @@ def _cleaned(path: Path, load: Callable[[], Array], teacher: Path, own_law: floa
         made = cleaned(load(), _teacher(teacher), own_law)
         assert made.residual is not None
         rows = np.concatenate([made.points, made.normals, made.residual, np.full((len(made.points), 1), made.disc)], axis=1)
-        part = path.with_suffix(".part.npy")
-        np.save(part, rows.astype(np.float32))
-        part.replace(path)
+        save_array(path, rows.astype(np.float32))
     rows = np.load(path).astype(np.float64)
     return Surface(rows[:, :3], rows[:, 3:6], float(rows[0, 9]), rows[:, 6:9], own_law)
 

@@ -6,11 +6,13 @@ them (dataset.py), how a teacher cleans them (distill.py).
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pcdenoise import io
 from pcdenoise.cloud.neighbours import distinct
@@ -120,11 +122,16 @@ def _folder(path: Path) -> Path:
 
 def _kept(path: Path, make: Callable[[], Array]) -> Array:
     if not path.exists():
-        part = path.with_suffix(".part.npy")
-        np.save(part, make().astype(np.float32))
-        part.replace(path)
+        save_array(path, make().astype(np.float32))
     kept: Array = np.load(path).astype(np.float64)
     return kept
+
+
+def save_array(path: Path, array: NDArray[np.float32]) -> None:
+    """Writes a file of a cache that several processes fill: it appears whole, and whoever is last does no harm."""
+    part = path.with_suffix(f".{os.getpid()}.npy")
+    np.save(part, array)
+    part.replace(path)
 
 
 def _surface(path: Path, sample: Callable[[], Array]) -> Surface:
