@@ -69,6 +69,16 @@ def test_verify_compares_the_content_of_vlrs_and_evlrs(
     assert name in capsys.readouterr().err
 
 
+def test_verify_allows_a_text_no_more_than_its_decimals_round(tmp_path: Path, rng: np.random.Generator) -> None:
+    points = np.round(rng.uniform(0, 1000, (200, 3)), 6)
+    before, after = tmp_path / "before.xyz", tmp_path / "after.xyz"
+    np.savetxt(before, points, fmt="%.6f")
+    points[7, 1] += 0.0008
+    np.savetxt(after, points, fmt="%.6f")
+    assert main(["verify", str(before), str(after), "--max-move", "0.0001"]) == 5
+    assert main(["verify", str(before), str(after), "--max-move", "0.0008"]) == 0
+
+
 def undone(raw: bytes, suffix: str, folder: Path, rng: np.random.Generator) -> bytes:
     """A file moved with its places kept, written with provenance, read and taken back."""
     original, moved, back = (folder / f"{name}{suffix}" for name in ("original", "moved", "back"))

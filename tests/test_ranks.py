@@ -45,7 +45,7 @@ def run():
     Run.learn = noted
     with ranks.joined() as both:
         trainer.train(config, folder / "whole")
-        dataset.CloudsAhead.clouds = lambda self, first, neighbours, ahead=6, stride=1: (
+        dataset.CloudsAhead.clouds = lambda self, first, neighbours, stride=1, n_makers=1: (
             self.cloud(number, neighbours) for number in itertools.count(first, stride)
         )
         try:

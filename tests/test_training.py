@@ -11,7 +11,7 @@ import torch
 
 from pcdenoise.config import TrainConfig
 from pcdenoise.errors import ModelError, UsageError
-from pcdenoise.learning import run, trainer
+from pcdenoise.learning import run, sources, trainer
 from pcdenoise.learning.dataset import CloudSource, Surface, draw_cloud, from_surface
 from pcdenoise.learning.distill import cleaned
 from pcdenoise.learning.sources import noisy_from, surfaces_from
@@ -103,12 +103,44 @@ def test_a_run_is_resumed_with_its_own_settings_and_its_curve_is_its_own(tmp_pat
         trainer.train(TINY, tmp_path, on_progress=interrupt)
     with pytest.raises(UsageError, match="--seed 1"):
         trainer.train(TINY.model_copy(update={"seed": 9}), tmp_path, resume=True)
+    with pytest.raises(UsageError, match="--init None"):
+        trainer.train(TINY, tmp_path, resume=True, init="unsupervised")
     with (tmp_path / run.LOG).open("a") as log:
-        log.write('{"step": 3, "error": 99}\n')  # learned after the last checkpoint, and lost with its process
-    trainer.train(TINY.model_copy(update={"steps": 4}), tmp_path, resume=True)
-    curve = [json.loads(line) for line in (tmp_path / run.LOG).read_text().splitlines()]
-    assert [line["step"] for line in curve] == [2, 4]
+        log.write('{"step": 3, "error": 99}\n{"step": 4, "er')  # after the last checkpoint: lost with its process
+    summary = trainer.train(TINY.model_copy(update={"steps": None}), tmp_path, resume=True)
+    assert summary.steps == TINY.steps  # and not as many as fit in the default budget
+    curve = run.curve_of(tmp_path)
+    assert [line["step"] for line in curve] == [2, 3]
     assert all(line["error"] < 10 for line in curve)
+
+
+def test_an_interrupt_within_a_step_does_not_count_it(tmp_path, monkeypatch):
+    whole = run.Run._differentiate
+
+    def interrupt(self: run.Run, *given: object) -> list[float]:
+        if self.step == 1:
+            raise KeyboardInterrupt
+        return whole(self, *given)
+
+    monkeypatch.setattr(run.Run, "_differentiate", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        trainer.train(TINY, tmp_path / "parts")
+    monkeypatch.undo()
+    trainer.train(TINY, tmp_path / "parts", resume=True)
+    trainer.train(TINY, tmp_path / "whole")
+    assert (tmp_path / "parts" / store.WEIGHTS).read_bytes() == (tmp_path / "whole" / store.WEIGHTS).read_bytes()
+
+
+def test_what_is_held_out_of_a_large_scan_is_held_out_of_all_its_parts(tmp_path, monkeypatch):
+    monkeypatch.setattr(sources, "_PART_POINTS", 800)
+    monkeypatch.setattr(sources, "in_unit_sphere", lambda points: points)  # so that a point is the same in all parts
+    np.savetxt(tmp_path / "scan.xyz", np.random.default_rng(0).random((4000, 3)))
+    (parts,) = noisy_from([str(tmp_path / "scan.xyz")], 0, tmp_path)
+    rows = np.concatenate([load() for load in parts])
+    held_out, learned = ({tuple(row) for row in rows[rows[:, 3] == chosen, :3]} for chosen in (0, 1))
+    assert len(held_out) + len(learned) < len(rows)  # parts overlap
+    assert not held_out & learned
+    assert len(held_out) == pytest.approx(len(learned) / 3, rel=0.2)
 
 
 def test_a_run_that_ends_before_it_learned_leaves_the_model_that_was_there(tmp_path, monkeypatch):

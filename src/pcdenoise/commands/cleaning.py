@@ -18,7 +18,14 @@ from pcdenoise.commands import outputs, selection
 from pcdenoise.commands.batch import Figures
 from pcdenoise.commands.console import Console, counted, figure
 from pcdenoise.commands.files import STREAM, Job, format_of
-from pcdenoise.commands.undo import refuse_taken, with_colours, with_displacement, with_outliers, with_uncertainty
+from pcdenoise.commands.undo import (
+    columns_to_add,
+    refuse_colourless,
+    with_colours,
+    with_displacement,
+    with_outliers,
+    with_uncertainty,
+)
 from pcdenoise.commands.verify import check_drift
 from pcdenoise.errors import ScanError, UsageError
 
@@ -107,16 +114,6 @@ class Cleaning:
         colour = {"colour": True} if self.colour else {}
         return {**self.config.model_dump(mode="json"), **self.selection.settings, **named, **colour}
 
-    @property
-    def _adding(self) -> dict[str, bool]:
-        """Which options are on that add columns."""
-        return {
-            "--displacement": self.displacement,
-            "--colour with --displacement": self.colour and self.displacement,
-            "--uncertainty": self.config.uncertainty,
-            "--outliers flag": self.config.outliers == "flag",
-        }
-
     def clean(self, job: Job) -> Figures:
         """Reads one scan, cleans it, writes it with its picture, and returns its figures; in cells on disk if it is too large."""
         from pcdenoise import io
@@ -137,12 +134,25 @@ class Cleaning:
             if stream is not None and (self.tile or self._is_too_large(stream)):
                 self._refuse_cells(job, stream)
         scan = io.read(job.source, format=format_of(job.source, self.format))
-        refuse_taken(scan, self._adding)
+        self._refuse(job, scan)
         self.selection.masks(scan)
+        return survey(scan, seed=self.config.seed, threads=self.config.threads or -1)
+
+    def _refuse(self, job: Job, scan: Scan) -> None:
+        """Raises ScanError for what could not be added to a scan, or not be written, once it is cleaned."""
+        from pcdenoise import io
+
+        asked = {
+            "--displacement": self.displacement,
+            "--uncertainty": self.config.uncertainty,
+            "--outliers flag": self.config.outliers == "flag",
+        }
+        added = columns_to_add(scan, [option for option, is_on in asked.items() if is_on])
+        if self.colour:
+            refuse_colourless(scan)
         written = format_of(job.target, self.format) or io.SUFFIXES.get(job.target.suffix.lower())
         if written and not self.drop_attributes:
-            io.refuse_losses(scan, job.target, written)
-        return survey(scan, seed=self.config.seed, threads=self.config.threads or -1)
+            io.refuse_losses(scan.with_attributes(**added), job.target, written)
 
     def _is_too_large(self, stream: Stream) -> bool:
         from pcdenoise.denoising.tiles import needed_bytes
@@ -183,11 +193,11 @@ class Cleaning:
         job.target.parent.mkdir(parents=True, exist_ok=True)
         folder = cells_of(job)
         about = job.source.stat()
+        self._refuse(job, next(stream.pieces(1)))
 
         def read() -> Iterator[Scan]:
             for piece in stream.pieces(_PIECE_ROWS):
                 _check_unchanged(job.source, about)
-                refuse_taken(piece, self._adding)
                 yield piece
 
         tiles = Tiles(
@@ -220,7 +230,7 @@ class Cleaning:
         started = time.perf_counter()
         self.console.detail(f"{job.source}: reading")
         scan = io.read(job.source, format=format_of(job.source, self.format))
-        refuse_taken(scan, self._adding)
+        self._refuse(job, scan)
         with self.console.progress(job.source.name) as on_progress:
             if self.selection == selection.Selection():
                 result = denoiser.denoise(scan.points, self.model, self.config, on_progress)

@@ -103,7 +103,7 @@ def denoise(
         bool, option("--drop-attributes", help="Allow a conversion to lose what the new format cannot hold.")
     ] = False,
     report: options.Report = None,
-    picture: options.Picture = None,
+    picture: options.Picture = "",
     dry_run: Annotated[bool, option("--dry-run", help="Print what would be done and write nothing.")] = False,
     config: options.Config = None,
     seed: options.Seed = 0,
@@ -135,14 +135,14 @@ def denoise(
         settings = settings.model_copy(update={"threads": settings.threads or n_threads})
     jobs = plan(sources, output, suffix=suffix, format=format, share=share) if output else [Job(at, _UNTOLD) for at in share]
     files.refuse_unknown([job.target for job in jobs if output], format)
-    drawn = plan(sources, str(picture), format="png", share=share, option="--picture") if picture else []
+    drawn = plan(sources, picture, format="png", share=share, option="--picture") if picture else []
     if is_far and any(STREAM in (job.source, job.target) for job in jobs):
         raise UsageError("-: workers have neither standard input nor output; name files, or leave --workers and --engine out")
     if engine == "dask":
         jobs, drawn = files.absolute(jobs), files.absolute(drawn)
     done = [job for job in jobs if resume and job.target != STREAM and job.target.exists()]
     jobs = [job for job in jobs if job not in done]
-    pictures = {picture.source: picture.target for picture in drawn if picture.source in {job.source for job in jobs}}
+    pictures = {job.source: job.target for job in drawn if job.source in {job.source for job in jobs}}
     refuse_existing([*(job.target for job in jobs), *pictures.values(), report], overwrite or resume)
     for job in [] if dry_run else done if resume else jobs:
         shutil.rmtree(cells_of(job), ignore_errors=True)
@@ -183,7 +183,7 @@ def _plan_text(records: list[dict[str, Any]], done: list[Job], settings: Denoise
                 record["input"],
                 f"{found['points']:,}",
                 figure(found.get("spacing", 0.0)),
-                figure(found["noise"]) if found.get("is_surface") else "no surface",
+                figure(settings.noise or found["noise"]) if found.get("is_surface") else "no surface",
                 str(settings.iters),
                 cost_text(cost(found["points"], 3 if settings.iters == "auto" else settings.iters)),
                 record["output"],

@@ -138,12 +138,13 @@ def configured(model: type[ConfigModel], **values: Any) -> ConfigModel:
         raise UsageError(f"{name}: {message}, got {first['input']!r}") from None
 
 
-def _suffix_known(option_name: str, suffixes: tuple[str, ...], what: str) -> Callable[[Any], Any]:
-    """A callback that refuses a file of another suffix before any work is done; a folder has none."""
+def _suffix_known(option_name: str, suffixes: tuple[str, ...], what: str, *, or_folder: bool = False) -> Callable[[Any], Any]:
+    """A callback that refuses a file of another suffix before any work is done; or_folder: none at all may be a folder's name."""
 
     def check(value: Any) -> Any:
         suffix = Path(str(value or "")).suffix.lower()
-        if suffix and suffix not in suffixes and not Path(str(value)).is_dir():
+        is_folder = or_folder and (not suffix or Path(str(value)).is_dir())
+        if value and suffix not in suffixes and not is_folder:
             raise UsageError(f"{option_name} {value}: {what} is written as {', '.join(suffixes)}; choose such a suffix")
         return value
 
@@ -151,7 +152,7 @@ def _suffix_known(option_name: str, suffixes: tuple[str, ...], what: str) -> Cal
 
 
 report_known = _suffix_known("--report", (".json", ".csv", ".html", ".htm"), "a report")
-picture_known = _suffix_known("--picture", (".png",), "a picture")
+picture_known = _suffix_known("--picture", (".png",), "a picture", or_folder=True)
 
 Inputs = Annotated[
     list[str], argument(metavar="IN...", help="Scans: files, folders, patterns like 'tiles/*.laz', or - for stdin.")
@@ -175,7 +176,7 @@ Report = Annotated[
     option("--report", callback=report_known, metavar="FILE", help="Write figures and settings to a .json, .csv or .html file."),
 ]
 Picture = Annotated[
-    Path | None, option("--picture", callback=picture_known, metavar="FILE", help="Write a .png picture; needs no display.")
+    str, option("--picture", callback=picture_known, metavar="OUT", help="Write a .png picture: a file, or a folder for several.")
 ]
 Overwrite = Annotated[bool, option("--overwrite", help="Replace files that exist.")]
 Seed = Annotated[int, common("--seed", min=0, help="Same seed, same bytes.")]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import asdict
 from functools import partial
@@ -90,7 +89,7 @@ def train(
     Example: pcdenoise train -o my_model --budget 20m
     """
     from pcdenoise.config import TrainConfig
-    from pcdenoise.learning import ranks, run, trainer
+    from pcdenoise.learning import ranks, trainer
 
     settings = configured(
         TrainConfig, data=data, method=method, network=network, pairs=pairs, neighbours=neighbours, learning_rate=learning_rate,
@@ -100,10 +99,8 @@ def train(
     refuse_existing([output / "config.json"], overwrite or resume)
     refuse_existing([report], overwrite)
     console = Console(quiet or not ranks.is_first())
-    if overwrite and not resume and ranks.is_first():
-        run.discard(output)
     with console.progress("train") as on_progress:
-        summary = trainer.train(settings, output, init=init, resume=resume, on_progress=on_progress)
+        summary = trainer.train(settings, output, init=init, resume=resume, overwrite=overwrite, on_progress=on_progress)
     if report and ranks.is_first():
         _save_report(report, output, asdict(summary), overwrite)
     console.note(f"{output}: {summary}")
@@ -113,14 +110,13 @@ def _save_report(path: Path, output: Path, figures: dict[str, Any], overwrite: b
     """Figures of a run and settings as it settled them, as HTML with its curve."""
     from pcdenoise.evaluation.charts import curve
     from pcdenoise.evaluation.report import Page
-    from pcdenoise.learning.run import LOG
+    from pcdenoise.learning.run import curve_of
     from pcdenoise.networks import store
 
     model = store.load(output)
     settings = {**model.config.training, "model": model.name, "model_sha256": model.sha256}
 
-    log = output / LOG
-    lines = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
+    lines = curve_of(output)
     errors = {"": [line["error"] for line in lines]}
     chart = curve(
         errors, title="Root mean square distance to the targets, of the noise", x_label="Step", x=[line["step"] for line in lines]

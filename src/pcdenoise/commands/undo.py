@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,7 +13,7 @@ from pcdenoise.commands.files import format_of, refuse_existing
 from pcdenoise.errors import ScanError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Sequence
 
     import numpy as np
     from numpy.typing import NDArray
@@ -30,6 +30,12 @@ UNCERTAINTY, OUTLIER = "uncertainty", "outlier"
 """Columns that `denoise --uncertainty` and `--outliers flag` add, after those: standard deviation of what the point may still be
 off, in the file's unit; 1 for an outlier."""
 _AFTERWARDS = (UNCERTAINTY, OUTLIER)
+_ADDED = {
+    "--displacement": {**dict.fromkeys((*ORIGINAL, *ORIGINAL_COLOUR), "f8"), DISPLACEMENT: "f4"},
+    "--uncertainty": {UNCERTAINTY: "f4"},
+    "--outliers flag": {OUTLIER: "u1"},
+}
+"""Columns by the option that adds them, or, the colours, that `undo` would take for its own."""
 
 
 def undo(
@@ -72,8 +78,7 @@ def with_colours(before: Scan, after: Scan, *, undoable: bool, threads: int | No
 
     from pcdenoise.denoising.colour import smoothed
 
-    if not set(COLOUR) <= set(after.attributes):
-        raise ScanError(f"{after.origin}: has no {', '.join(COLOUR)}; leave out --colour")
+    refuse_colourless(after)
     old = np.stack([after.attributes[name] for name in COLOUR], axis=1)
     moved = (before.points != after.points).any(axis=1)
     new = np.where(moved[:, None], smoothed(after.points, old, threads or -1), old)
@@ -92,17 +97,24 @@ def with_outliers(after: Scan, outlier: Mask) -> Scan:
     return after.with_attributes(**{OUTLIER: outlier.astype("u1")})
 
 
-def refuse_taken(scan: Scan, asked: Mapping[str, bool]) -> None:
-    """Raises ScanError where a column that an option adds is there already, and would be lost. asked: options that are on."""
-    columns = {
-        "--displacement": (*ORIGINAL, DISPLACEMENT),
-        "--colour with --displacement": ORIGINAL_COLOUR,
-        "--uncertainty": (UNCERTAINTY,),
-        "--outliers flag": (OUTLIER,),
-    }
-    for option, names in columns.items():
-        if asked.get(option) and (taken := [name for name in names if name in scan.attributes]):
-            raise ScanError(f"{scan.origin}: has a column {taken[0]} already; undo or rename it first, or leave out {option}")
+def columns_to_add(scan: Scan, options: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Columns of zeros like those that options will add. Raises ScanError where one is there already, and would be lost."""
+    import numpy as np
+
+    added: dict[str, NDArray[Any]] = {}
+    for option in options:
+        for name, kind in _ADDED[option].items():
+            if name in scan.attributes:
+                raise ScanError(f"{scan.origin}: has a column {name} already; undo or rename it first, or leave out {option}")
+            if name not in ORIGINAL_COLOUR:
+                added[name] = np.broadcast_to(np.zeros(1, kind), len(scan))
+    return added
+
+
+def refuse_colourless(scan: Scan) -> None:
+    """Raises ScanError for a scan without colours to smooth."""
+    if not set(COLOUR) <= set(scan.attributes):
+        raise ScanError(f"{scan.origin}: has no {', '.join(COLOUR)}; leave out --colour")
 
 
 def restored(scan: Scan) -> Scan:

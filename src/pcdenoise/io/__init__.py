@@ -91,7 +91,8 @@ def write(
 def refuse_losses(scan: Scan, path: str | os.PathLike[str], format: str) -> None:
     """Raises ScanError if writing the scan in a format would drop something."""
     if lost := losses(scan, format):
-        fix = f"allow dropping attributes (--drop-attributes) or write .{scan.format}"
+        other = f" or write .{scan.format}" if not same_kind(format, scan.format) else ""
+        fix = f"allow dropping attributes (--drop-attributes){other}"
         raise ScanError(f"{os.fspath(path)}: {format} would drop {', '.join(lost)}; {fix}")
 
 
@@ -196,7 +197,9 @@ def rounding(scan: Scan) -> float:
     largest = np.abs(points).max()
     step = coordinate_step(scan) or 4 * float(np.spacing(largest))
     if scan.format == "xyz":
-        step = text.COORDINATE_STEP * float(np.ptp(points, axis=0).max())
+        decimals = text.fewest_decimals(points.ravel())
+        coarsest = text.COORDINATE_STEP * float(np.ptp(points, axis=0).max())
+        step = max(step, coarsest if decimals is None else min(coarsest, 10.0**-decimals))
     elif coordinate_step(scan) is None and (points == points.astype(np.float32)).all():
         step = float(np.spacing(np.float32(largest)))
     return 3**0.5 / 2 * step

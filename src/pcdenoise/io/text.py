@@ -268,7 +268,7 @@ def coordinates(rows: TextRows, column: ColumnIndex, before: Points, after: Colu
 
     Values that are short decimals themselves, as those a file gave before they moved, are printed exactly.
     """
-    if (short := _fewest_decimals(after[moved])) is not None:
+    if (short := fewest_decimals(after[moved])) is not None:
         return NewFields(after, f"%.{short}f", column, moved)
     return NewFields(after, coordinate_form(before, *rows.decimals(column)), column, moved)
 
@@ -282,7 +282,7 @@ def coordinate_form(before: Points, digits: int, exponent: bool) -> str:
     return f"%.{min(max(digits, needed), 17)}f"
 
 
-def _fewest_decimals(values: Column) -> int | None:
+def fewest_decimals(values: Column) -> int | None:
     """The fewest decimals, up to 12, that all values have; None if some have more."""
     for decimals in range(13):
         if all(bool((np.round(some, decimals) == some).all()) for some in (values[:64], values)):

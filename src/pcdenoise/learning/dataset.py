@@ -5,12 +5,13 @@ Not here: where surfaces and scans come from (sources.py), losses, the training 
 
 from __future__ import annotations
 
-import os
 import re
+import signal
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from itertools import count
 from multiprocessing import get_context
@@ -23,6 +24,7 @@ from scipy.spatial import cKDTree
 from pcdenoise.cloud.neighbours import coordinate_hash, knn, spatial_order
 from pcdenoise.cloud.noise_level import estimate
 from pcdenoise.denoising.seeds import coarsen, share_of_seeds
+from pcdenoise.errors import PcdenoiseError
 from pcdenoise.synthesis import noise
 
 Array = NDArray[np.float64]
@@ -46,7 +48,7 @@ _LAWS = {
 """How often each law of noise is met."""
 
 
-_PROCESSORS_PER_MAKER, _AHEAD = 4, 6
+_AHEAD = 6  # clouds that wait for each process that makes them
 _LIKELY_OTHERS = 6
 """Residuals come from any of so many samples: with the nearest alone neighbours would share one, and noise would look smaller."""
 
@@ -122,24 +124,25 @@ def from_surface(load: Callable[[], Surface], neighbours: int, rng: np.random.Ge
 def from_noisy(load: Callable[[], Array], neighbours: int, rng: np.random.Generator, *, judging: bool = False) -> TrainingCloud:
     """A noisy cloud as it is, turned at random, some points held out: the network sees 40 to 70 % of them.
 
-    judging: it sees those that `learned_from` gives, and the others are held out.
+    judging: it sees those that `learned_from` gives, and the others are held out; then the rows have a fourth column.
     """
-    points = load()
-    seen = _is_learned_from(points) if judging else rng.random(len(points)) < rng.uniform(0.4, 0.7)
-    points = points @ np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    rows = load()
+    seen = rows[:, 3] > 0 if judging else rng.random(len(rows)) < rng.uniform(0.4, 0.7)
+    points = rows[:, :3] @ np.linalg.qr(rng.standard_normal((3, 3)))[0]
     clutter = np.zeros(int(seen.sum()), dtype=bool)
     return _prepared(points[seen], clutter, 0.0, neighbours, rng, held_out=points[~seen])
 
 
 def learned_from(load: Callable[[], Array]) -> Array:
-    """(M, 3) three in four points of a noisy cloud, always the same; the rest are kept to judge by."""
-    points = load()
-    return points[_is_learned_from(points)]
+    """(M, 3) those points of a noisy cloud that its fourth column does not set aside to judge by."""
+    rows = load()
+    return rows[rows[:, 3] > 0, :3]
 
 
-def _is_learned_from(points: Array) -> Mask:
-    learned_from: Mask = coordinate_hash(points, 0) >= np.uint64(2**62)
-    return learned_from
+def is_learned_from(points: Array) -> Mask:
+    """(N,) three in four points of a scan, by a hash of their place in the file: the same in every part that is cut of it."""
+    chosen: Mask = coordinate_hash(points, 0) >= np.uint64(2**62)
+    return chosen
 
 
 def draw_cloud(surface: Surface, neighbours: int, rng: np.random.Generator) -> TrainingCloud:
@@ -285,6 +288,10 @@ def _with_outliers(noisy: Array, clutter: Mask, rng: np.random.Generator) -> tup
 CloudT = TypeVar("CloudT")
 
 
+def _leave_interrupts_to_the_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 class CloudsAhead(ABC, Generic[CloudT]):
     """An endless series of training clouds, made ahead of time by other processes."""
 
@@ -292,16 +299,17 @@ class CloudsAhead(ABC, Generic[CloudT]):
     def cloud(self, number: int, neighbours: int) -> CloudT:
         """The number-th cloud; it depends on nothing but the source and these."""
 
-    def clouds(self, first: int, neighbours: int, stride: int = 1, n_makers: int | None = None) -> Iterator[CloudT]:
-        """Endless clouds from the first-th on, every stride-th, from one process for every four processors if not given."""
-        n_makers = n_makers or max(1, (os.cpu_count() or 1) // _PROCESSORS_PER_MAKER)
+    def clouds(self, first: int, neighbours: int, stride: int = 1, n_makers: int = 1) -> Iterator[CloudT]:
+        """Endless clouds from the first-th on, every stride-th, made by so many processes."""
         ahead = _AHEAD * n_makers
-        with ProcessPoolExecutor(n_makers, mp_context=get_context("spawn")) as makers:
+        with ProcessPoolExecutor(n_makers, get_context("spawn"), _leave_interrupts_to_the_parent) as makers:
             waiting = deque(makers.submit(self.cloud, first + i * stride, neighbours) for i in range(ahead))
             try:
                 for number in count(first + ahead * stride, stride):
                     yield waiting.popleft().result()
                     waiting.append(makers.submit(self.cloud, number, neighbours))
+            except BrokenProcessPool:
+                raise PcdenoiseError("a process that makes clouds to learn from was killed; free memory, then --resume") from None
             finally:
                 makers.shutdown(cancel_futures=True)
 

@@ -31,7 +31,7 @@ def distilled(noisy: list[NoisyClouds], teacher: Path, cache: Path, own_law: flo
     cache.mkdir(parents=True, exist_ok=True)
     return [
         [
-            partial(from_surface, partial(_cleaned, cache / f"{i}_{n}.npy", load, teacher, own_law))
+            partial(from_surface, partial(_kept_clean, cache / f"{i}_{n}.npy", load, teacher, own_law))
             for n, load in enumerate(clouds)
         ]
         for i, clouds in enumerate(noisy)
@@ -48,9 +48,9 @@ def cleaned(points: Array, model: store.Model, own_law: float) -> Surface:
     return Surface(clean, normals, disc, points - clean, own_law)
 
 
-def _cleaned(path: Path, load: Callable[[], Array], teacher: Path, own_law: float) -> Surface:
+def _kept_clean(path: Path, load: Callable[[], Array], teacher: Path, own_law: float) -> Surface:
     if not path.exists():
-        made = cleaned(load(), _teacher(teacher), own_law)
+        made = cleaned(load()[:, :3], _teacher(teacher), own_law)
         assert made.residual is not None
         rows = np.concatenate([made.points, made.normals, made.residual, np.full((len(made.points), 1), made.disc)], axis=1)
         save_array(path, rows.astype(np.float32))

@@ -12,6 +12,8 @@ from torch import Tensor, distributed
 
 from pcdenoise.errors import PcdenoiseError, in_one_line
 
+_THREADS_PER_MAKER = 4
+
 
 @dataclass(frozen=True)
 class Ranks:
@@ -55,6 +57,12 @@ class Ranks:
             for tensor, mean in zip(tensors, means, strict=True):
                 tensor.copy_(mean.view_as(tensor))
         return [float(total) for total in sums]
+
+    def n_makers(self, threads: int | None) -> int:
+        """How many processes make clouds for this one: one for every four threads that it may use."""
+        usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        here = int(os.environ.get("LOCAL_WORLD_SIZE", self.count))
+        return max(1, (threads or usable // here) // _THREADS_PER_MAKER)
 
     def wait(self) -> None:
         """Until all processes are here."""

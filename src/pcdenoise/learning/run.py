@@ -9,10 +9,10 @@ from __future__ import annotations
 import copy
 import json
 import math
-import os
 import shutil
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,6 +29,7 @@ from pcdenoise.learning.ranks import Ranks
 from pcdenoise.learning.split import held_out_error
 from pcdenoise.networks import store
 from pcdenoise.networks.projection import ProjectionNetwork
+from pcdenoise.whole_files import replaced
 
 CHECKPOINT, TEACHER, LOG = ".checkpoint.safetensors", ".teacher", "training.jsonl"
 _SAVE_EVERY, _LOG_EVERY = 200, 50
@@ -85,7 +86,10 @@ class Run:
     @property
     def progress(self) -> float:
         """Share of the budget or the steps that is spent, by the first process's clock; all processes must ask together."""
-        by_steps = self.step / self.config.steps if self.config.steps else 0.0
+        return self._progress_at(self.step)
+
+    def _progress_at(self, step: int) -> float:
+        by_steps = step / self.config.steps if self.config.steps else 0.0
         budget_s = self.config.budget_s or (None if self.config.steps else _DEFAULT_BUDGET_S)
         return max(by_steps, self.ranks.agreed(self.seconds) / budget_s if budget_s else 0.0)
 
@@ -95,14 +99,20 @@ class Run:
         return math.sqrt(sum(self._errors) / len(self._errors)) if self._errors else math.inf
 
     @property
+    def state(self) -> str:
+        """How far it is, in words."""
+        off = f", {self.recent_error:.3f} of the noise off" if self._errors else ""
+        return f"step {self.step:,}{off}"
+
+    @property
     def summary(self) -> TrainingSummary:
         """The record so far."""
         return TrainingSummary(self.step, self.points, self.seconds, self.recent_error, self._verdict)
 
     def learn(self, signal: Signal, cloud: Any) -> None:
         """One step on one cloud a process; one without judged points or with a loss that is no number teaches nothing."""
-        self.step += 1
-        progress = self.progress
+        number = self.step + 1
+        progress = self._progress_at(number)
         self.optimiser.zero_grad()
         errors = self._differentiate(signal, cloud, progress)
         shared = [_gradient(parameter) for parameter in self.network.parameters()] if self.ranks.count > 1 else []
@@ -110,19 +120,20 @@ class Run:
         figures = [sum(errors), cloud.n_points if errors else 0]
         error, n_points, n_taught = self.ranks.averaged(shared, figures, len(errors))
         if not n_taught:
+            self.step = number
             return
         for group in self.optimiser.param_groups:
-            group["lr"] = self._peak * self._plan.rate(self.step, progress)
+            group["lr"] = self._peak * self._plan.rate(number, progress)
         nn.utils.clip_grad_norm_(self.network.parameters(), self._plan.clip)
         self.optimiser.step()
-        keep = min(1 - 1 / _AVERAGED_STEPS, self.step / (self.step + 10)) if self._plan.is_averaged else 0.0
+        keep = min(1 - 1 / _AVERAGED_STEPS, number / (number + 10)) if self._plan.is_averaged else 0.0
         with torch.no_grad():
             for slow, fast in zip(self.average.parameters(), self.network.parameters(), strict=True):
                 slow.lerp_(fast, 1 - keep)
             for kept, current in zip(self.average.buffers(), self.network.buffers(), strict=True):
                 kept.copy_(current)
         self._errors = [*self._errors[-99:], error / n_taught]
-        self.points += int(n_points)
+        self.points, self.step = self.points + int(n_points), number
         if self.step % _LOG_EVERY == 0 and self.ranks.is_first:
             self._log()
         if self.step % _SAVE_EVERY == 0 and self.ranks.is_first:
@@ -132,7 +143,7 @@ class Run:
         """Leaves the gradient of this process's cloud in the network; gives its error, or nothing if it teaches nothing."""
         if not cloud.n_points:
             return []
-        rng = np.random.default_rng([self.config.seed, 17, self.ranks.number(self.step)])
+        rng = np.random.default_rng([self.config.seed, 17, self.ranks.number(self.step + 1)])
         loss, error = signal(self.network, cloud, min(progress, 1.0), rng)
         if not torch.isfinite(loss):
             return []
@@ -167,7 +178,7 @@ class Run:
 
     def save(self) -> None:
         """Everything that `load` needs, as safetensors: weights, running mean, the optimiser's moments, the record."""
-        from safetensors.torch import save_file
+        from safetensors.torch import save
 
         tensors = {f"network.{n}": t for n, t in self.network.state_dict().items()}
         tensors |= {f"average.{n}": t for n, t in self.average.state_dict().items()}
@@ -175,10 +186,11 @@ class Run:
             for key, value in self.optimiser.state.get(parameter, {}).items():
                 tensors[f"{key}.{name}"] = value
         record = {"step": self.step, "points": self.points, "seconds": self.seconds, "errors": self._errors}
-        record |= {"settings": self._settings, "init": self.init}
-        part = self.output / f"{CHECKPOINT}.part"
-        save_file({n: t.detach().contiguous().clone() for n, t in tensors.items()}, part, metadata={"record": json.dumps(record)})
-        os.replace(part, self.output / CHECKPOINT)
+        length = {"steps": self.config.steps, "budget_s": self.config.budget_s}
+        record |= {"settings": self._settings, "init": self.init, "length": length}
+        whole = {name: tensor.detach().contiguous().clone() for name, tensor in tensors.items()}
+        with replaced(self.output / CHECKPOINT) as file:
+            file.write(save(whole, {"record": json.dumps(record)}))
 
     def load(self) -> None:
         """Continues where `save` left off. Raises UsageError without a checkpoint and with other settings, ModelError with one
@@ -203,16 +215,16 @@ class Run:
                 self.optimiser.state[parameter] = state
         self.step, self.points, self._before_s = record["step"], record["points"], record["seconds"]
         self._errors, self._began = record["errors"], time.monotonic()
-        self._forget_steps_after()
+        if self.ranks.is_first:
+            self._forget_steps_after()
 
     def _forget_steps_after(self) -> None:
         """Cuts from the log what was learned after the checkpoint, since it is learned again."""
-        log = self.output / LOG
-        lines = log.read_text().splitlines(keepends=True) if log.exists() else []
-        kept = [line for line in lines if json.loads(line)["step"] <= self.step]
+        kept = [line for line in curve_of(self.output) if line["step"] <= self.step]
         if kept:
-            log.write_text("".join(kept))
-            self._logged = json.loads(kept[-1])["step"]
+            with replaced(self.output / LOG) as log:
+                log.write("".join(json.dumps(line) + "\n" for line in kept).encode())
+            self._logged = kept[-1]["step"]
 
     @property
     def _settings(self) -> dict[str, Any]:
@@ -244,6 +256,15 @@ class Run:
         )
 
 
+def curve_of(output: Path) -> list[dict[str, Any]]:
+    """The lines of a run's log, without one that was cut off as it was written."""
+    lines = []
+    for line in (output / LOG).read_text().splitlines() if (output / LOG).exists() else []:
+        with suppress(ValueError):
+            lines.append(json.loads(line))
+    return lines
+
+
 def record_of(path: Path) -> dict[str, Any]:
     """What a checkpoint says of its run. Raises UsageError without a checkpoint, ModelError with one that is none."""
     from safetensors import SafetensorError, safe_open
@@ -253,7 +274,7 @@ def record_of(path: Path) -> dict[str, Any]:
     try:
         with safe_open(path, framework="pt") as file:
             record: dict[str, Any] = json.loads(file.metadata()["record"])
-            record["settings"], record["step"]
+            record["settings"], record["step"], record["init"], record["length"]
     except (SafetensorError, KeyError, ValueError, TypeError) as fault:
         raise _no_checkpoint(path, fault) from None
     return record

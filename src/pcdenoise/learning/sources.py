@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pcdenoise import io
 from pcdenoise.cloud.neighbours import distinct
 from pcdenoise.errors import ScanError, UsageError
-from pcdenoise.learning.dataset import N_DENSE, PROCEDURAL, Array, Surface, measured
+from pcdenoise.learning.dataset import N_DENSE, PROCEDURAL, Array, Surface, is_learned_from, measured
 from pcdenoise.learning.scans import DATASET, files_of
 from pcdenoise.synthesis.meshes import MESH_SUFFIXES, load_mesh, sample_mesh
 from pcdenoise.synthesis.shapes import in_unit_sphere, random_surface
@@ -29,7 +29,8 @@ _MOST_PARTS = 32
 
 Surfaces = list[Callable[[], Surface]]
 NoisyClouds = list[Callable[[], Array]]
-"""Functions that give (N, 3) noisy points in the unit sphere, always the same ones."""
+"""Functions that give noisy points in the unit sphere, always the same ones: (N, 3), or (N, 4) of scans, where the last column is
+1 for those to learn from and 0 for those to judge by (dataset.learned_from)."""
 
 
 def are_scans(data: Sequence[str]) -> bool:
@@ -55,13 +56,12 @@ def noisy_from(data: Sequence[str], seed: int, cache: Path) -> list[NoisyClouds]
     found: list[NoisyClouds] = []
     for number, text in enumerate(data):
         folder = _folder(cache / str(number))
-        clouds: Sequence[Callable[[], Array]]
         if PROCEDURAL.fullmatch(text) or (not (_existing(text) / DATASET).is_file() and _meshes(_existing(text))):
             surfaces = _surfaces(text, seed, folder)
             clouds = [partial(_measured, surface, [seed, 3, number, n]) for n, surface in enumerate(surfaces)]
+            found.append([partial(_kept, folder / f"noisy_{n}.npy", cloud) for n, cloud in enumerate(clouds)])
         else:
-            clouds = _parts_of_scans(_existing(text), seed)
-        found.append([partial(_kept, folder / f"noisy_{n}.npy", cloud) for n, cloud in enumerate(clouds)])
+            found.append([partial(_loaded, path) for path in _parts_of_scans(_existing(text), seed, folder)])
     return found
 
 
@@ -96,8 +96,9 @@ def _is_mesh(path: Path) -> bool:
         return b"element face" in file.read(8192)
 
 
-def _parts_of_scans(path: Path, seed: int) -> list[Callable[[], Array]]:
-    parts: list[Callable[[], Array]] = []
+def _parts_of_scans(path: Path, seed: int, folder: Path) -> list[Path]:
+    """Files, one for each part: points in the unit sphere, and whether they are to learn from."""
+    parts: list[Path] = []
     for file, _ in files_of([path]):
         scan = io.read(file)
         points = scan.points[scan.finite]
@@ -106,10 +107,12 @@ def _parts_of_scans(path: Path, seed: int) -> list[Callable[[], Array]]:
             continue
         rng = np.random.default_rng([seed, 5, len(parts)])
         n_parts = 1 if len(points) <= _PART_POINTS else min(_MOST_PARTS, 2 * len(points) // _PART_POINTS)
+        learned = is_learned_from(points)
         for centre in points[rng.choice(len(points), size=n_parts, replace=False)]:
             distance = np.linalg.norm(points - centre, axis=1)
-            part = points if n_parts == 1 else points[np.argpartition(distance, _PART_POINTS)[:_PART_POINTS]]
-            parts.append(partial(np.asarray, in_unit_sphere(part)))
+            rows = np.arange(len(points)) if n_parts == 1 else np.argpartition(distance, _PART_POINTS)[:_PART_POINTS]
+            parts.append(folder / f"noisy_{len(parts)}.npy")
+            save_array(parts[-1], np.column_stack([in_unit_sphere(points[rows]), learned[rows]]).astype(np.float32))
     if not parts:
         raise UsageError(f"{path}: no scan with {_FEWEST_POINTS} points or more; give scans, a folder of them, or shapes:200")
     return parts
@@ -123,6 +126,10 @@ def _folder(path: Path) -> Path:
 def _kept(path: Path, make: Callable[[], Array]) -> Array:
     if not path.exists():
         save_array(path, make().astype(np.float32))
+    return _loaded(path)
+
+
+def _loaded(path: Path) -> Array:
     kept: Array = np.load(path).astype(np.float64)
     return kept
 

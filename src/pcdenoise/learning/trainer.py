@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ import torch
 
 from pcdenoise.config import TrainConfig
 from pcdenoise.errors import UsageError
-from pcdenoise.learning.dataset import Array, CloudsAhead, CloudSource, TrainingCloud, from_noisy, from_surface, learned_from
+from pcdenoise.learning.dataset import CloudsAhead, CloudSource, TrainingCloud, from_noisy, from_surface, learned_from
 from pcdenoise.learning.distill import distilled
 from pcdenoise.learning.ranks import joined
 from pcdenoise.learning.run import CHECKPOINT, TEACHER, OnProgress, Run, Signal, TrainingSummary, discard, record_of
@@ -47,6 +47,7 @@ def train(
     *,
     init: str | None = None,
     resume: bool = False,
+    overwrite: bool = False,
     on_progress: OnProgress | None = None,
 ) -> TrainingSummary:
     """Learns from the surfaces or scans in `config.data` and writes the model folder `output`.
@@ -55,17 +56,30 @@ def train(
     Where split or distill learn from scans alone, the shipped model is adapted to them unless `init` says otherwise ("none": a
     new network), and comes back as it was unless the change shows on a quarter of the points, which no step learns from.
     Under torchrun each process learns from clouds of its own, gradients are averaged, and the first process writes.
+    A run that is resumed has the start of its first part, and its length if no other is given. An unfinished run in the folder is
+    only replaced with `overwrite`.
     Raises UsageError when there is nothing to resume or to learn from, and when a run is resumed with other settings.
     """
     if config.threads:
         torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
-    if resume and init is None:
-        init = record_of(output / CHECKPOINT).get("init")
+    if resume:
+        config, init = _as_begun(config, init, record_of(output / CHECKPOINT), output)
+    elif (output / CHECKPOINT).exists() and not overwrite:
+        raise UsageError(f"{output}: holds an unfinished run; give --resume to go on with it, or another folder")
     config, init, adapts = _settled(config, init)
     with joined() as ranks:
         run = Run(config, output, _initial(config, init), ranks, init)
         return _trained(run, adapts, resume, on_progress or (lambda _words, _share: None))
+
+
+def _as_begun(config: TrainConfig, init: str | None, record: dict[str, Any], output: Path) -> tuple[TrainConfig, str | None]:
+    """Where the run that is resumed began, and its length where none is given. Raises UsageError for another beginning."""
+    if init not in (None, record["init"]):
+        raise UsageError(f"{output}: the run to resume has --init {record['init']}, not {init}; leave --init out")
+    if config.steps is None and config.budget_s is None:
+        config = config.model_copy(update=record["length"])
+    return config, record["init"]
 
 
 def _trained(run: Run, adapts: bool, resume: bool, on_progress: OnProgress) -> TrainingSummary:
@@ -73,8 +87,6 @@ def _trained(run: Run, adapts: bool, resume: bool, on_progress: OnProgress) -> T
     before = copy.deepcopy(run.network) if adapts else None
     if resume:
         run.load()
-    elif (output / CHECKPOINT).exists():
-        raise UsageError(f"{output}: holds an unfinished run; give --resume to go on with it, or another folder")
     with tempfile.TemporaryDirectory(prefix="pcdenoise-clouds-") as cache:
         lessons = _lessons(config, Path(cache), adapts)
         output.mkdir(parents=True, exist_ok=True)
@@ -85,15 +97,16 @@ def _trained(run: Run, adapts: bool, resume: bool, on_progress: OnProgress) -> T
                 until = 1.0 if lap + 1 == lessons.laps else _FIRST_LAP + (1 - _FIRST_LAP) * lap / (lessons.laps - 1)
                 if run.progress >= until:
                     continue
-                for cloud in lessons.source(lap, run).clouds(
-                    ranks.number(run.step), _neighbours(run.network), stride=ranks.count
-                ):
+                clouds = lessons.source(lap, run).clouds(
+                    ranks.number(run.step), _neighbours(run.network), stride=ranks.count, n_makers=ranks.n_makers(config.threads)
+                )
+                for cloud in clouds:
                     if run.progress >= until:
                         break
                     run.learn(lessons.signal, cloud)
-                    on_progress(f"step {run.step}, {run.recent_error:.3f} of the noise off", run.progress)
+                    on_progress(run.state, run.progress)
             if isinstance(before, ProjectionNetwork) and ranks.is_first:
-                run.judge(before, _judges(config, Path(cache), before.config.neighbours), on_progress)
+                run.judge(before, _judges(lessons.noisy, config.seed, before.config.neighbours), on_progress)
             if not run.points and not adapts:
                 raise UsageError(
                     f"{output}: no cloud taught anything in {run.step} steps; learn for longer, or from larger scans"
@@ -101,6 +114,8 @@ def _trained(run: Run, adapts: bool, resume: bool, on_progress: OnProgress) -> T
         finally:
             if ranks.is_first and run.points:
                 run.save_model()
+            elif ranks.is_first and not resume:
+                discard(output)
     if ranks.is_first:
         if not run.points:
             run.save_model()
@@ -127,23 +142,29 @@ def _settled(config: TrainConfig, init: str | None) -> tuple[TrainConfig, str | 
 
 @dataclass(frozen=True)
 class _Lessons:
-    """What is learned from, lap after lap, and how. source: from the lap's number and the run to its clouds."""
+    """What is learned from, lap after lap, and how. source: from the lap's number and the run to its clouds.
+
+    noisy: where they come from, with the points that nothing is learned from, if a model is adapted to them.
+    """
 
     source: Callable[[int, Run], CloudsAhead[Any]]
     signal: Signal
     laps: int = 1
+    noisy: Sequence[NoisyClouds] = ()
 
 
 def _lessons(config: TrainConfig, cache: Path, adapts: bool) -> _Lessons:
     """By method: surfaces, noisy clouds with points held out, clouds that a teacher has cleaned, or targets from a prior."""
     supervised: Signal = lambda network, cloud, _progress, _rng: supervised_loss(network, cloud)  # noqa: E731
-    if config.method == "distill":
-        return _Lessons(partial(_cleaned, _noisy(config, cache, adapts), cache), supervised, config.laps)
+    if config.method in ("distill", "split"):
+        noisy = noisy_from(config.data, config.seed, cache)
+        clouds: list[NoisyClouds] = [[partial(learned_from, load) for load in some] for some in noisy] if adapts else noisy
+        judges = noisy if adapts else ()
+        if config.method == "distill":
+            return _Lessons(partial(_cleaned_by_then, clouds, cache), supervised, config.laps, judges)
+        halves = CloudSource([[partial(from_noisy, load) for load in some] for some in clouds], config.seed)
+        return _Lessons(lambda _lap, _run: halves, lambda network, cloud, *_: split_loss(network, cloud), noisy=judges)
     source: CloudsAhead[Any]
-    if config.method == "split":
-        draws = [[partial(from_noisy, load) for load in some] for some in _noisy(config, cache, adapts)]
-        source = CloudSource(draws, config.seed)
-        return _Lessons(lambda _lap, _run: source, lambda network, cloud, _progress, _rng: split_loss(network, cloud))
     if config.method == "supervised" and config.network == "projection" and not config.pairs:
         surfaces = surfaces_from(config.data, config.seed, cache)
         source = CloudSource([[partial(from_surface, load) for load in some] for some in surfaces], config.seed)
@@ -155,7 +176,7 @@ def _lessons(config: TrainConfig, cache: Path, adapts: bool) -> _Lessons:
     )
 
 
-def _cleaned(noisy: list[NoisyClouds], cache: Path, lap: int, run: Run) -> CloudSource:
+def _cleaned_by_then(noisy: list[NoisyClouds], cache: Path, lap: int, run: Run) -> CloudSource:
     """Clouds as what was learned so far cleans them; that teacher stays beside the checkpoint, for a run that is resumed."""
     teacher = run.output / f"{TEACHER}-{lap}"
     if run.ranks.is_first and not (teacher / store.CONFIG).exists():
@@ -165,16 +186,9 @@ def _cleaned(noisy: list[NoisyClouds], cache: Path, lap: int, run: Run) -> Cloud
     return CloudSource(distilled(noisy, teacher, cache / f"lap-{lap}", own_law), run.config.seed)
 
 
-def _noisy(config: TrainConfig, cache: Path, adapts: bool) -> list[list[Callable[[], Array]]]:
-    """Noisy clouds to learn from, without the points that an adapted model is judged by."""
-    noisy = noisy_from(config.data, config.seed, cache)
-    return [[partial(learned_from, load) for load in some] for some in noisy] if adapts else noisy
-
-
-def _judges(config: TrainConfig, cache: Path, neighbours: int) -> list[TrainingCloud]:
+def _judges(noisy: Sequence[NoisyClouds], seed: int, neighbours: int) -> list[TrainingCloud]:
     """Noisy clouds with the points held out that no step learned from, to compare weights by."""
-    noisy = noisy_from(config.data, config.seed, cache)
-    source = CloudSource([[partial(from_noisy, load, judging=True) for load in some] for some in noisy], config.seed + 1)
+    source = CloudSource([[partial(from_noisy, load, judging=True) for load in some] for some in noisy], seed + 1)
     return [source.cloud(number, neighbours) for number in range(_JUDGED_CLOUDS)]
 
 
