@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -83,7 +82,7 @@ def trial(case: Case, folder: Path, budget_s: float | None, steps: int | None) -
     about = {"scan": case.name, "points": len(case.noisy), "noise": case.noise, "noise_read": guessed.figures["noise"]}
     about |= {"shipped": case.rms(guessed.points), "told": case.rms(told.points)}
     if steps == 0:
-        return {**about, "steps": 0, "adapted": math.nan, "learned": math.nan, "verdict": "nothing was learned"}
+        return {**about, "steps": 0, "adapted": None, "learned": None, "verdict": "nothing was learned"}
     judge = Run.judge
 
     def remembering(run: Run, *given: Any) -> None:
@@ -119,7 +118,8 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             row = trial(case, Path(folder), options.budget_s, options.steps)
         rows.append(row)
-        shown = {name: f"{row[name]:.3f}" for name in ("shipped", "told", "adapted", "learned")}
+        errors = ("shipped", "told", "adapted", "learned")
+        shown = {name: "–" if row[name] is None else f"{row[name]:.3f}" for name in errors}
         noise = f"{row['noise']:.4f}, {row['noise_read']:.4f}"
         print(
             f"| {row['scan']} | {noise} | {shown['shipped']} | {shown['told']} | {row['steps']} | {shown['adapted']} |"

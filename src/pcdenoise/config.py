@@ -63,7 +63,7 @@ class TrainConfig(Settings):
         description="Signal; supervised: surfaces or clouds that are known; split: noisy points held out; distill: noisy clouds"
         " that a teacher cleaned; total: neighbours drawn by a prior. By default supervised, for scans distill.",
     )
-    laps: int = Field(2, ge=1, le=20, description="How often distillation makes what was learned the teacher.")
+    laps: int = Field(2, ge=1, le=20, description="Teachers of a distillation in turn: the start, then what was learned by then.")
     network: Literal["projection", "mcconv"] = Field("projection", description="Architecture; mcconv is the paper's.")
     pairs: bool = Field(False, description="Supervised by the noisy and clean clouds of synth folders, not by surfaces.")
     prior: Literal["full", "space", "none"] = Field("space", description="What makes a neighbour likely: space, and colour.")

@@ -65,7 +65,7 @@ def train(
     ] = None,
     part_points: Annotated[int, _prior("--part-points", min=1000, help="Cut larger scans to parts of so many points.")] = 150_000,
     laps: Annotated[
-        int, _prior("--laps", min=1, max=20, help="distill: how often what was learned so far becomes the teacher.")
+        int, _prior("--laps", min=1, max=20, help="distill: teachers in turn, the starting model, then what was learned by then.")
     ] = 2,
     steps: Annotated[int | None, option("--steps", min=1, help="Stop after so many steps.")] = None,
     budget: Annotated[

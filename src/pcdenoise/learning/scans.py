@@ -1,6 +1,6 @@
 """Noisy scans and noisy/clean pairs as training data, in parts of a bounded size and in the network's unit of length.
 
-Not here: meshes and procedural surfaces (dataset.py), targets (priors.py), losses.
+Not here: meshes and procedural surfaces (sources.py), targets (priors.py), losses.
 """
 
 from __future__ import annotations
