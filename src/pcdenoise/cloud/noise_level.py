@@ -60,7 +60,7 @@ def estimate(points: Points, seed: int = 0, threads: int = -1, known_std: float 
 
     Neighbourhoods grow until a share of all places shows a surface; the noise is what a quadric height field leaves there,
     its six degrees of freedom given back. Exact duplicates count once. Fewer than 16 distinct points show no surface, and std 0.
-    known_std: the noise where somebody knows it, which is then the std; what remains to be found is the scale at which the surface
+    known_std: the noise where somebody knows it, and then the std; what remains to be found is the scale at which the surface
     shows under it.
     """
     points = points[distinct(points)[0]]
