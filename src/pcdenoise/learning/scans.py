@@ -67,7 +67,7 @@ class ScanCloud:
 def parts_from(config: TrainConfig, cache: Path) -> list[Part]:
     """Cuts all scans in `config.data` (files, folders of scans, folders made by synth) to parts and keeps them in `cache`.
 
-    Raises UsageError when there is none, when colours or clean clouds are asked for that are not there, and when a scan must be
+    Raises UsageError when there is none, when colours or clean clouds are asked for that are not there, and when a scan is to be
     cut but the unit of length is its own diagonal.
     """
     found: list[Part] = []
@@ -79,9 +79,10 @@ def parts_from(config: TrainConfig, cache: Path) -> list[Part]:
         if len(rows) < FEWEST_POINTS:
             continue
         colour = colours_of(scan)[rows] if config.method == "total" and config.prior == "full" else np.zeros((0, 3))
-        clean = io.read(clean_path).points if clean_path is not None else np.zeros((0, 3))
-        if config.method == "supervised" and not len(clean):
+        is_supervised = config.method == "supervised"
+        if is_supervised and clean_path is None:
             raise UsageError(f"{scan_path}: supervised learning needs its clean cloud; give folders made by pcdenoise synth")
+        clean = io.read(clean_path).points if is_supervised and clean_path is not None else np.zeros((0, 3))
         points = scan.points[rows]
         low, high = points.min(axis=0), points.max(axis=0)
         unit = config.unit or float(np.linalg.norm(high - low)) or 1.0
@@ -96,6 +97,8 @@ def parts_from(config: TrainConfig, cache: Path) -> list[Part]:
                 continue
             middle = (points[piece].min(axis=0) + points[piece].max(axis=0)) / 2
             truth = clean[_near(clean, points[piece], 2 * PATCH_RADIUS * unit)]
+            if is_supervised and not len(truth):
+                raise UsageError(f"{clean_path}: lies nowhere near {scan_path}; clean and noisy clouds must be of one frame")
             path = cache / f"part_{len(found)}.npz"
             np.savez(
                 path,
