@@ -16,6 +16,7 @@ import pytest
 from known_clouds import UTM, cloud, model
 from pcdenoise import io
 from pcdenoise.cloud.scan import Scan
+from pcdenoise.commands import main
 from pcdenoise.commands.memory import LEAST, n_bytes
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import denoiser, tiles
@@ -104,6 +105,14 @@ def test_what_is_done_is_not_done_again_and_another_job_starts_anew(tmp_path: Pa
 
 
 # Files
+
+
+@pytest.mark.parametrize("format", ["las", "ply"])
+def test_a_file_without_points_is_cleaned_in_cells_as_well(format: str, tmp_path: Path) -> None:
+    empty, clean = tmp_path / f"empty.{format}", tmp_path / f"clean.{format}"
+    io.write(Scan(np.empty((0, 3)), format=format), empty)
+    assert main(["denoise", str(empty), "-o", str(clean), "--tile", "1000", "-q"]) == 0
+    assert len(io.read(clean)) == 0
 
 
 def scan_of(n: int, format: str, folder: Path, rng: np.random.Generator) -> Path:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -147,7 +148,7 @@ class Cleaning:
             "--uncertainty": self.config.uncertainty,
             "--outliers flag": self.config.outliers == "flag",
         }
-        added = columns_to_add(scan, [option for option, is_on in asked.items() if is_on])
+        added = columns_to_add(scan, [option for option, is_asked in asked.items() if is_asked])
         if self.colour:
             refuse_colourless(scan)
         written = format_of(job.target, self.format) or io.SUFFIXES.get(job.target.suffix.lower())
@@ -193,7 +194,8 @@ class Cleaning:
         job.target.parent.mkdir(parents=True, exist_ok=True)
         folder = cells_of(job)
         about = job.source.stat()
-        self._refuse(job, next(stream.pieces(1)))
+        for piece in islice(stream.pieces(1), 1):
+            self._refuse(job, piece)
 
         def read() -> Iterator[Scan]:
             for piece in stream.pieces(_PIECE_ROWS):
