@@ -25,7 +25,7 @@ import itertools, sys
 from pathlib import Path
 from safetensors.torch import save_file
 from pcdenoise.config import TrainConfig
-from pcdenoise.learning import dataset, ranks, trainer
+from pcdenoise.learning import ahead, ranks, trainer
 from pcdenoise.learning.run import Run
 
 folder, config = Path(sys.argv[1]), TrainConfig(**{SETTINGS!r})
@@ -45,7 +45,7 @@ def run():
     Run.learn = noted
     with ranks.joined() as both:
         trainer.train(config, folder / "whole")
-        dataset.CloudsAhead.clouds = lambda self, first, neighbours, stride=1, n_makers=1: (
+        ahead.CloudsAhead.clouds = lambda self, first, neighbours, stride=1, n_makers=1: (
             self.cloud(number, neighbours) for number in itertools.count(first, stride)
         )
         try:

@@ -64,8 +64,9 @@ def pairs(
         noisy = [] if to == "npz" else [output / target_name(job.source, "_noisy", to)]
         refuse_existing([*targets, *noisy], overwrite)
         output.mkdir(parents=True, exist_ok=True)
+        number = jobs.index(job)
         for draw, target in enumerate(targets):
-            rng = np.random.default_rng([seed, jobs.index(job), draw])
+            rng = np.random.default_rng([seed, number, draw])
             clean = pseudo_clean(points, colours, prior=chosen, rng=rng)
             if to == "npz":
                 memory = BytesIO()

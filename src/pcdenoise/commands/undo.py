@@ -130,10 +130,8 @@ def restored(scan: Scan) -> Scan:
     present = list(scan.attributes)
     places = [*ORIGINAL, DISPLACEMENT]
     if set(places) <= set(present):
-        after = present[present.index(DISPLACEMENT) + 1 :]
-        added = [name for name in present if name in (*places, *ORIGINAL_COLOUR)] + [
-            name for name in after if name in _AFTERWARDS
-        ]
+        after = set(present[present.index(DISPLACEMENT) :]) & set(_AFTERWARDS)
+        added = [name for name in present if name in {*places, *ORIGINAL_COLOUR, *after}]
     else:
         added = _last_columns(scan)
         places = added[:4]

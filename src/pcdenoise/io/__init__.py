@@ -195,13 +195,15 @@ def rounding(scan: Scan) -> float:
     if not len(points):
         return 0.0
     largest = np.abs(points).max()
-    step = coordinate_step(scan) or 4 * float(np.spacing(largest))
-    if scan.format == "xyz":
-        decimals = text.fewest_decimals(points.ravel())
-        coarsest = text.COORDINATE_STEP * float(np.ptp(points, axis=0).max())
-        step = max(step, coarsest if decimals is None else min(coarsest, 10.0**-decimals))
-    elif coordinate_step(scan) is None and (points == points.astype(np.float32)).all():
-        step = float(np.spacing(np.float32(largest)))
+    step = coordinate_step(scan)
+    if step is None:
+        step = 4 * float(np.spacing(largest))
+        if scan.format == "xyz":
+            decimals = text.fewest_decimals(points.ravel())
+            coarsest = text.COORDINATE_STEP * float(np.ptp(points, axis=0).max())
+            step = max(step, coarsest if decimals is None else min(coarsest, 10.0**-decimals))
+        elif (points == points.astype(np.float32)).all():
+            step = float(np.spacing(np.float32(largest)))
     return 3**0.5 / 2 * step
 
 

@@ -1,21 +1,14 @@
 """Clouds to learn from: noisy points, their seeds, and, where something knows it, the surface.
 
-Not here: where surfaces and scans come from (sources.py), losses, the training loop.
+Not here: where surfaces and scans come from (sources.py), how clouds are made while others are learned from (ahead.py), losses,
+the training loop.
 """
 
 from __future__ import annotations
 
 import re
-import signal
-from abc import ABC, abstractmethod
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import count
-from multiprocessing import get_context
-from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +17,7 @@ from scipy.spatial import cKDTree
 from pcdenoise.cloud.neighbours import coordinate_hash, knn, spatial_order
 from pcdenoise.cloud.noise_level import estimate
 from pcdenoise.denoising.seeds import coarsen, share_of_seeds
-from pcdenoise.errors import PcdenoiseError
+from pcdenoise.learning.ahead import CloudsAhead
 from pcdenoise.synthesis import noise
 
 Array = NDArray[np.float64]
@@ -48,7 +41,6 @@ _LAWS = {
 """How often each law of noise is met."""
 
 
-_AHEAD = 6  # clouds that wait for each process that makes them
 _LIKELY_OTHERS = 6
 """Residuals come from any of so many samples: with the nearest alone neighbours would share one, and noise would look smaller."""
 
@@ -283,35 +275,6 @@ def _with_outliers(noisy: Array, clutter: Mask, rng: np.random.Generator) -> tup
         return noisy, clutter
     result, wrong = noise.outliers(noisy, rng.uniform(0.001, 0.02), rng, reach=rng.uniform(0.01, 0.1))
     return result, clutter | wrong
-
-
-CloudT = TypeVar("CloudT")
-
-
-def _leave_interrupts_to_the_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-class CloudsAhead(ABC, Generic[CloudT]):
-    """An endless series of training clouds, made ahead of time by other processes."""
-
-    @abstractmethod
-    def cloud(self, number: int, neighbours: int) -> CloudT:
-        """The number-th cloud; it depends on nothing but the source and these."""
-
-    def clouds(self, first: int, neighbours: int, stride: int = 1, n_makers: int = 1) -> Iterator[CloudT]:
-        """Endless clouds from the first-th on, every stride-th, made by so many processes."""
-        ahead = _AHEAD * n_makers
-        with ProcessPoolExecutor(n_makers, get_context("spawn"), _leave_interrupts_to_the_parent) as makers:
-            waiting = deque(makers.submit(self.cloud, first + i * stride, neighbours) for i in range(ahead))
-            try:
-                for number in count(first + ahead * stride, stride):
-                    yield waiting.popleft().result()
-                    waiting.append(makers.submit(self.cloud, number, neighbours))
-            except BrokenProcessPool:
-                raise PcdenoiseError("a process that makes clouds to learn from was killed; free memory, then --resume") from None
-            finally:
-                makers.shutdown(cancel_futures=True)
 
 
 class CloudSource(CloudsAhead[TrainingCloud]):

@@ -256,6 +256,13 @@ class Run:
         )
 
 
+def discard(output: Path) -> None:
+    """Forgets what an unfinished run left in its folder, so that another one can begin there; a model in it stays."""
+    (output / CHECKPOINT).unlink(missing_ok=True)
+    for teacher in output.glob(f"{TEACHER}-*"):
+        shutil.rmtree(teacher)
+
+
 def curve_of(output: Path) -> list[dict[str, Any]]:
     """The lines of a run's log, without one that was cut off as it was written."""
     lines = []
@@ -319,10 +326,3 @@ _PLANS = {
     "projection": _Plan(3e-3, partial(torch.optim.AdamW, betas=(0.9, 0.98), weight_decay=1e-4), _cosine, 1.0, True),
     "mcconv": _Plan(5e-3, torch.optim.Adam, _stairs, math.inf, False),
 }
-
-
-def discard(output: Path) -> None:
-    """Forgets what an unfinished run left in its folder, so that another one can begin there; a model in it stays."""
-    (output / CHECKPOINT).unlink(missing_ok=True)
-    for teacher in output.glob(f"{TEACHER}-*"):
-        shutil.rmtree(teacher)

@@ -21,7 +21,8 @@ from pcdenoise.cloud.scan import Points, Scan
 from pcdenoise.config import TrainConfig
 from pcdenoise.denoising.seeds import Seeds, coarsen, share_of_seeds
 from pcdenoise.errors import ScanError, UsageError
-from pcdenoise.learning.dataset import N_LANDING, N_RAW, N_SEEDS, PROCEDURAL, CloudsAhead
+from pcdenoise.learning.ahead import CloudsAhead
+from pcdenoise.learning.dataset import N_LANDING, N_RAW, N_SEEDS, PROCEDURAL
 from pcdenoise.learning.priors import Prior
 
 DATASET = "dataset.json"

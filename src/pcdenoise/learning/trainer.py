@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +19,8 @@ import torch
 
 from pcdenoise.config import TrainConfig
 from pcdenoise.errors import UsageError
-from pcdenoise.learning.dataset import CloudsAhead, CloudSource, TrainingCloud, from_noisy, from_surface, learned_from
+from pcdenoise.learning.ahead import CloudsAhead
+from pcdenoise.learning.dataset import CloudSource, TrainingCloud, from_noisy, from_surface, learned_from
 from pcdenoise.learning.distill import distilled
 from pcdenoise.learning.ranks import joined
 from pcdenoise.learning.run import CHECKPOINT, TEACHER, OnProgress, Run, Signal, TrainingSummary, discard, record_of
@@ -97,14 +99,14 @@ def _trained(run: Run, adapts: bool, resume: bool, on_progress: OnProgress) -> T
                 until = 1.0 if lap + 1 == lessons.laps else _FIRST_LAP + (1 - _FIRST_LAP) * lap / (lessons.laps - 1)
                 if run.progress >= until:
                     continue
-                clouds = lessons.source(lap, run).clouds(
-                    ranks.number(run.step), _neighbours(run.network), stride=ranks.count, n_makers=ranks.n_makers(config.threads)
-                )
-                for cloud in clouds:
-                    if run.progress >= until:
-                        break
-                    run.learn(lessons.signal, cloud)
-                    on_progress(run.state, run.progress)
+                first, n_makers = ranks.number(run.step), ranks.n_makers(config.threads)
+                series = lessons.source(lap, run).clouds(first, _neighbours(run.network), stride=ranks.count, n_makers=n_makers)
+                with closing(series) as clouds:  # who makes them must be gone before what they keep them in is
+                    for cloud in clouds:
+                        if run.progress >= until:
+                            break
+                        run.learn(lessons.signal, cloud)
+                        on_progress(run.state, run.progress)
             if isinstance(before, ProjectionNetwork) and ranks.is_first:
                 run.judge(before, _judges(lessons.noisy, config.seed, before.config.neighbours), on_progress)
             if not run.points and not adapts:
