@@ -54,7 +54,7 @@ def test_on_a_curved_surface_points_slide_and_land_on_it_again(name: str, curvat
 def test_no_point_goes_further_than_the_noise_can_have_displaced_it(name: str) -> None:
     clean, reach = cloud(name, 2000, 0.0), relaxation._REACH_STDS
     assert reach <= 2
-    for std in (0.01 * clean.spacing, 0.2 * clean.spacing):
+    for std in (0.2 * clean.spacing, 0.5 * clean.spacing):
         slide = moves(clean.clean, relax(clean.clean, std, 30, threads=1))
         assert slide.max() <= reach * std * (1 + 1e-9)
         assert slide.max() > 0.95 * reach * std  # the bound is met, or this would test nothing

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pcdenoise.cloud.neighbours import (
     Distances,
+    Identity,
     Indices,
     NeighbourSearch,
     coordinate_hash,
@@ -35,9 +36,11 @@ _CERTAIN_ASPECT, _SMALL_SHARE = 4.4, 1 / 40
 once a neighbourhood is half of them."""
 _CLEARER_SHARE = 0.3  # this share of all places must show it: edges and thin parts stay thick at any scale
 _SEEN = ([3.0, 3.7, 4.1, 4.7, 5.2, 6.1, 8.0], [0.72, 0.82, 0.86, 0.9, 0.92, 0.94, 0.95])
-N_PLACES = 4000
-"""Places at which `around` looks."""
-_FEWEST_AROUND, _MOST_AROUND = 32, 1024
+_POINTS_PER_PLACE, _PLACES_AROUND, _PLACES_SEED = 32, 12, 5
+"""Noise by place is read at one point in so many, and is a mean over so many readings."""
+_ENOUGH = 48  # points tell what a neighbourhood of any size leaves: of larger ones a share is drawn
+MOST_TIMES = 2.5
+"""Noise by place is within so many times that of the whole cloud."""
 _SCALE_STDS = 4.5  # the radius of the neighbourhood of `scale_points`
 
 
@@ -47,12 +50,14 @@ class NoiseLevel:
 
     scale_points: how many nearest points show a surface rather than a ball of noise; it grows as std² times density.
     is_surface: whether any scale shows one (False: vegetation, clutter, a filled volume).
+    is_known: whether somebody told the std.
     """
 
     std: float
     spacing: float
     scale_points: float
     is_surface: bool
+    is_known: bool = False
 
 
 def estimate(points: Points, seed: int = 0, threads: int = -1, known_std: float | None = None) -> NoiseLevel:
@@ -92,12 +97,13 @@ Nearest = Callable[[Points, int], tuple[Distances, Points]]
 
 def estimate_from(probed: Points, n_points: int, nearest: Nearest, known_std: float | None = None) -> NoiseLevel:
     """`estimate` at (M, 3) probes of a cloud that only `nearest` knows; it is asked for up to 2048 neighbours."""
+    is_known = known_std is not None
     if n_points < 2:
-        return NoiseLevel(known_std or 0.0, 0.0, float(_LADDER[0]), False)
+        return NoiseLevel(known_std or 0.0, 0.0, float(_LADDER[0]), False, is_known)
     probed = probed[spatial_order(probed)]
     spacing = float(np.median(nearest(probed, 2)[0][:, 1]))
     if n_points < _LADDER[0]:
-        return NoiseLevel(known_std or 0.0, spacing, float(_LADDER[0]), False)
+        return NoiseLevel(known_std or 0.0, spacing, float(_LADDER[0]), False, is_known)
 
     rungs: list[_Rung] = []
     for k in (k for k in _LADDER if k <= n_points):
@@ -113,44 +119,83 @@ def estimate_from(probed: Points, n_points: int, nearest: Nearest, known_std: fl
     shown = [rung for rung in rungs if rung.aspect >= _SURFACE_ASPECT]
     if not shown:
         std = known_std or max(rungs, key=lambda rung: rung.aspect).std
-        return NoiseLevel(std, spacing, float(_LADDER[0]), False)
+        return NoiseLevel(std, spacing, float(_LADDER[0]), False, is_known)
     std = known_std or shown[0].std
     certain = shown[0].k <= _SMALL_SHARE * n_points or max(rung.aspect for rung in shown) >= _CERTAIN_ASPECT
-    return NoiseLevel(std, spacing, _points_within(_SCALE_STDS * std, rungs), certain)
+    return NoiseLevel(std, spacing, _points_within(_SCALE_STDS * std, rungs), certain, is_known)
 
 
 def around(points: Points, level: NoiseLevel, at: Points | None = None, seed: int = 0, threads: int = -1) -> NDArray[np.float64]:
     """(M,) noise std of (N, 3) finite points around each of (M, 3) places, the points themselves if not given.
 
     The map to the one number of `estimate`; NaN where no surface shows.
-
-    At up to N_PLACES points of even spread neighbourhoods grow from the cloud's own scale until they show a surface, and hold
-    what a quadric leaves in them. Each point gets the root mean square of the three places nearest to it.
     """
     at = points if at is None else at
-    values = np.full(len(at), np.nan)
-    rows = distinct(points)[0]
-    if len(rows) < _LADDER[0]:
-        return values
-    cloud = points[rows][spatial_order(points[rows])]
-    rng = np.random.default_rng(seed)
-    places = cloud[np.sort(rng.choice(len(cloud), size=min(N_PLACES, len(cloud)), replace=False))]
+    cloud = points[distinct(points)[0]]
+    cloud = cloud[spatial_order(cloud)]
+    places, std = _readings(cloud, drawn_by(coordinate_hash(cloud, 0), seed), level, threads)
+    if not len(places):
+        return np.full(len(at), np.nan)
+    return _spread(places, std, at, threads)
+
+
+def by_place(points: Points, identity: Identity, level: NoiseLevel, threads: int = -1) -> NDArray[np.float64]:
+    """(N,) noise std at (N, 3) distinct points in spatial order, as a pass takes it: never NaN, MOST_TIMES the level's at most.
+
+    Noise that is known, and that of places without a surface, is the level's. Places are drawn by identity (N,), and what is read
+    there and spread from there lies near, so that a part of a cloud gives what the whole does.
+    """
+    everywhere = np.full(len(points), level.std)
+    if level.is_known or level.std <= 0:
+        return everywhere
+    places, std = _readings(points, drawn_by(identity, _PLACES_SEED), level, threads)
+    if not len(places):
+        return everywhere
+    std = np.where(np.isnan(std), level.std, std)
+    return _spread(places, np.clip(std, level.std / MOST_TIMES, level.std * MOST_TIMES), points, threads)
+
+
+def _readings(points: Points, drawn: NDArray[np.uint64], level: NoiseLevel, threads: int) -> tuple[Points, NDArray[np.float64]]:
+    """(P, 3) places, some of (N, 3) points in spatial order as drawn, and the noise std (P,) that shows there.
+
+    Neighbourhoods grow from the cloud's own scale until they show a surface, and hold what a quadric leaves in them; NaN where
+    none does. Of large ones a share of the points is looked at.
+    """
+    kept = np.uint64(int(float(2**64 - 2**11) * min(1.0, _ENOUGH / level.scale_points)))
+    few = drawn <= kept
+    places, cloud = points[drawn <= kept // np.uint64(_POINTS_PER_PLACE)], points[few]
+    if len(cloud) < _LADDER[0] or not len(places):
+        return places[:0], np.empty(0)
     search = NeighbourSearch(cloud, threads)
     std = np.full(len(places), np.nan)
-    first = min(max(2 * level.scale_points, _FEWEST_AROUND), _MOST_AROUND / 4)
-    for k in (round(first), round(2 * first), round(4 * first)):
+    first = int(np.clip(level.scale_points, _LADDER[1], _ENOUGH))
+    for k in (min(times * first, len(cloud)) for times in (1, 2, 4)):
         for block in np.array_split(np.flatnonzero(np.isnan(std)), max(1, len(places) * k // _PROBED)):
             distances, indices = search.knn(places[block], k)
             radius = np.maximum(distances[:, -1], 1e-300)
             aspect = 1 / np.maximum(_quadric_residual(cloud[indices], places[block], radius), 1e-6)
-            shown = aspect >= _CERTAIN_ASPECT
+            shown = aspect >= _SURFACE_ASPECT
             std[block[shown]] = (radius / aspect)[shown] / np.interp(aspect[shown], *_SEEN)
-    nearest = NeighbourSearch(places, threads).knn(at, 3)[1]
-    known = ~np.isnan(std[nearest])
-    n_known = known.sum(axis=1)
-    squared = np.where(known, np.nan_to_num(std[nearest]) ** 2, 0).sum(axis=1)
-    values[n_known > 0] = np.sqrt(squared[n_known > 0] / n_known[n_known > 0])
-    return values
+    return places, std
+
+
+def _spread(places: Points, std: NDArray[np.float64], at: Points, threads: int) -> NDArray[np.float64]:
+    """(M,) noise around (M, 3) points: each of the (P, 3) places takes the mean of its neighbours, then points that of places.
+
+    Means are geometric: single readings scatter by factors. NaN where nothing was read at any of those places.
+    """
+
+    def mean(at: Points, k: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        distances, index = search.knn(at, k)
+        weight = 1 - 0.99 * (distances / np.maximum(distances[:, -1:], 1e-300)) ** 2
+        weight = weight * ~np.isnan(values[index])
+        with np.errstate(invalid="ignore"):
+            averaged: NDArray[np.float64] = (weight * np.nan_to_num(values[index])).sum(axis=1) / weight.sum(axis=1)
+        return averaged
+
+    search = NeighbourSearch(places, threads)
+    logarithm = np.log(np.maximum(std, 1e-300))
+    return np.exp(mean(at, 3, mean(places, _PLACES_AROUND, logarithm)))
 
 
 def _points_within(radius: float, rungs: list[_Rung]) -> float:

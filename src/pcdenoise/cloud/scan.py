@@ -18,11 +18,11 @@ Mask = NDArray[np.bool_]
 _EXTENTS = (1e-15, 1e15)
 
 
-def within(reach: float, start: Points, moved: Points) -> Points:
-    """(N, 3) moved points, but none further than `reach` from its start."""
+def within(reach: float | NDArray[np.float64], start: Points, moved: Points) -> Points:
+    """(N, 3) moved points, but none further than `reach` from its start, a length for all or (N,) one for each."""
     slide = moved - start
-    length = np.linalg.norm(slide, axis=1, keepdims=True)
-    cut: Points = start + slide * (reach / np.maximum(length, max(reach, 1e-300)))
+    length = np.linalg.norm(slide, axis=1)
+    cut: Points = start + slide * (reach / np.maximum(length, np.maximum(reach, 1e-300)))[:, None]
     return cut
 
 

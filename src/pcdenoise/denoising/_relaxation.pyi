@@ -8,17 +8,21 @@ Graph: TypeAlias = tuple[int, int]
 def tangents(
     graph: Graph, start: int, stop: int, points: int, planarity_from: float, planarity_to: float, normals: int, sheet: int, /
 ) -> None: ...
-def push(
+def even(
     graph: Graph,
     start: int,
     stop: int,
     points: int,
+    began: int,
     normals: int,
     sheet: int,
     spacing: int,
-    pushing: float,
-    longest: float,
-    pushed: int,
+    held: int,
+    waves: int,
+    directions: int,
+    open_: float,
+    wall: float,
+    evened: int,
     /,
 ) -> None: ...
 def land(graph: Graph, start: int, stop: int, points: int, began: int, normals: int, sheet: int, landed: int, /) -> None: ...

@@ -274,19 +274,20 @@ def one_pass(
 
     Strength and limit are not applied.
     """
+    noise: float | NDArray[np.float64] = level.std
     if config.method != "network":
         moved = _filtered(points, level, diagonal, config, threads)
         return _unshrunk(points, moved, diagonal, config) if config.unshrink else moved
     if model is None:
         raise UsageError("--method network needs a model; give --model, or choose --method jet")
     if isinstance(model.config.settings, ProjectionSettings):
-        moved = network_pass.projection(points, identity, level, model, config.seed, threads, on_share)
+        moved, noise = network_pass.projection(points, identity, level, model, config.seed, threads, on_share)
         moved = _unshrunk(points, moved, diagonal, config) if config.unshrink else moved
     else:
         unit = model.config.settings.unit or diagonal
         moved = network_pass.mcconv(points, unit, model, config.seed, threads, on_share)
         moved = moved if config.unshrink is False else _unshrunk(points, moved, unit, config)
-    return relax(within(_FURTHEST_STDS * level.std, points, moved), level.std, config.relax_steps, threads)
+    return relax(within(_FURTHEST_STDS * noise, points, moved), noise, config.relax_steps, threads)
 
 
 def _filtered(points: Points, level: NoiseLevel, diagonal: float, config: DenoiseConfig, threads: int) -> Points:

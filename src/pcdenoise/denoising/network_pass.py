@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdenoise.cloud.neighbours import Identity
-from pcdenoise.cloud.noise_level import NoiseLevel
+from pcdenoise.cloud.noise_level import NoiseLevel, by_place
 from pcdenoise.cloud.scan import Points
 from pcdenoise.denoising.seeds import coarsen, share_of_seeds
 from pcdenoise.networks import fused
@@ -31,18 +31,19 @@ def projection(
     seed: int,
     threads: int,
     on_share: Callable[[float], None],
-) -> Points:
+) -> tuple[Points, NDArray[np.float64]]:
     """Coarse to fine in O(N·K): seeds find the surface, all points land on it, as far as there is one.
 
-    identity (N,): what seeds are drawn by.
+    identity (N,): what seeds are drawn by. Gives the places and the noise (N,) that was found around each.
     """
     sizes = model.config.settings
     assert isinstance(sizes, ProjectionSettings)
     share = share_of_seeds(level, sizes.neighbours)
-    seeds, count, cell, raw = points, None, np.arange(len(points)), None
+    noise = by_place(points, identity, level, threads)
+    seeds, count, cell, raw, seed_noise = points, None, np.arange(len(points)), None, noise
     if share < 1:
-        coarse = coarsen(points, share, seed, threads, identity)
-        seeds, count, cell, raw = coarse.points, coarse.count, coarse.cell, points
+        coarse = coarsen(points, share, seed, threads, identity, noise / level.std)
+        seeds, count, cell, raw, seed_noise = coarse.points, coarse.count, coarse.cell, points, coarse.means(noise)
     total = len(seeds) * sum(sizes.rounds) + (len(points) * sizes.landing_rounds if share < 1 else 0)
     done, counting = 0, Lock()
 
@@ -53,21 +54,21 @@ def projection(
             on_share(done / total)
 
     if fused.fits(sizes):
-        given = (model.weights, sizes, seeds, count, raw, level.std)
+        given = (model.weights, sizes, seeds, count, raw, seed_noise, noise)
         moved, shape = fused.descend(*given, threads=threads, on_block=on_block)
     else:
-        moved, shape = _in_torch(model, seeds, count, raw, level.std, threads, on_block)
-    return points + trust(shape, level.std)[cell, None] * (moved - points)
+        moved, shape = _in_torch(model, seeds, count, raw, (seed_noise, noise), threads, on_block)
+    return points + trust(shape, seed_noise)[cell, None] * (moved - points), noise
 
 
-def trust(shape: NDArray[np.float32], noise: float) -> NDArray[np.float64]:
+def trust(shape: NDArray[np.float32], noise: fused.Noise) -> NDArray[np.float64]:
     """(M,) from 0, no surface here (foliage, wires, clutter), to 1: the noise explains how thick it is, or it is flat anyway.
 
     shape (M, 3): ascending standard deviations of neighbourhoods along their axes. On noisy surfaces 19 of 20 are thinner than
     1.5 std; a wire or a filled volume has a planarity, (middle - thin) / wide, of about 0.2, a plane 0.7, the edge of a box 0.35.
     """
     thin, middle, wide = shape.astype(np.float64).T
-    unexplained = np.clip((thin / max(noise, 1e-30) - 1.5) / 0.7, 0, 1)
+    unexplained = np.clip((thin / np.maximum(noise, 1e-30) - 1.5) / 0.7, 0, 1)
     flat = np.clip(((middle - thin) / np.maximum(wide, 1e-30) - 0.15) / 0.2, 0, 1)
     trusted: NDArray[np.float64] = 1 - unexplained * (1 - flat)
     return trusted
@@ -78,7 +79,7 @@ def _in_torch(
     seeds: Points,
     count: NDArray[np.float64] | None,
     raw: Points | None,
-    noise: float,
+    noise: tuple[NDArray[np.float64], NDArray[np.float64]],
     threads: int,
     on_block: Callable[[int], None],
 ) -> tuple[Points, NDArray[np.float32]]:
@@ -89,7 +90,7 @@ def _in_torch(
 
     assert isinstance(model.network, ProjectionNetwork)
     with _torch_threads(1), torch.no_grad():  # of blocks, which are spread over threads already
-        descent = descend(model.network, seeds, count, raw, noise, threads=threads, on_block=on_block)
+        descent = descend(model.network, seeds, count, raw, *noise, threads=threads, on_block=on_block)
     landed = descent.seeds[-1] if descent.landed is None else descent.landed
     return landed.numpy(), descent.shape.numpy()
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from pcdenoise.cloud.blocks import BLOCK_POINTS, blocks, each_block
 from pcdenoise.cloud.neighbours import NeighbourSearch
 from pcdenoise.cloud.scan import Points
-from pcdenoise.networks.fused import checked_finite
+from pcdenoise.networks.fused import Noise, checked_finite
 from pcdenoise.networks.projection import (
     Edges,
     Planes,
@@ -49,7 +49,8 @@ def descend(
     seeds: Points,
     count: NDArray[np.float64] | None,
     raw: Points | None,
-    noise: float,
+    noise: Noise,
+    raw_noise: Noise | None = None,
     *,
     block_points: int = BLOCK_POINTS,
     threads: int = 1,
@@ -57,7 +58,8 @@ def descend(
 ) -> Descent:
     """Runs the network on (M, 3) seeds and lands (Q, 3) raw points on them; differentiable where gradients are on.
 
-    Points stay float64 and only differences between neighbours become float32. The result does not depend on `block_points`.
+    noise: its standard deviation at the seeds (M,), raw_noise: at the raw points (Q,); or one for all. Points stay float64 and
+    only differences between neighbours become float32. The result does not depend on `block_points`.
     Raises ModelError when a stage gives positions that are not numbers.
     """
     points = torch.from_numpy(np.ascontiguousarray(seeds))
@@ -67,8 +69,9 @@ def descend(
         search = NeighbourSearch(sources.detach().numpy(), threads)
         return torch.from_numpy(search.nearest(points.detach().numpy(), network.config.neighbours))
 
-    def looking(points: Tensor, sources: Tensor, index: Tensor) -> _Looking:
-        return _Looking(points, sources, index, weights, noise, block_points, threads)
+    def looking(points: Tensor, sources: Tensor, index: Tensor, noise: Noise = noise) -> _Looking:
+        everywhere = torch.as_tensor(noise, dtype=torch.float32).expand(len(points))
+        return _Looking(points, sources, index, weights, everywhere, block_points, threads)
 
     index = nearest(points, points)
     features: Tensor | None = None
@@ -88,7 +91,8 @@ def descend(
         return Descent(stages, shape, None)
     seed_planes = looking(points, points, index).planes()
     landing = torch.from_numpy(np.ascontiguousarray(raw))
-    move = looking(landing, points, nearest(landing, points)).landing(network.landing, seed_planes, features, on_block)
+    on_seeds = looking(landing, points, nearest(landing, points), noise if raw_noise is None else raw_noise)
+    move = on_seeds.landing(network.landing, seed_planes, features, on_block)
     return Descent(stages, shape, _numbers(landing + move.double()))
 
 
@@ -100,11 +104,12 @@ def _numbers(points: Tensor) -> Tensor:
 class _Looking:
     """M points that look at their nearest sources, block by block; with a single block nothing is computed twice.
 
-    points (M, 3), sources (N, 3) float64; index (M, K) int32: rows of each point's sources; count (N,) or None.
+    points (M, 3), sources (N, 3) float64; index (M, K) int32: rows of each point's sources; count (N,) or None;
+    noise (M,).
     """
 
     def __init__(
-        self, points: Tensor, sources: Tensor, index: Tensor, count: Tensor | None, noise: float, block_points: int, threads: int
+        self, points: Tensor, sources: Tensor, index: Tensor, count: Tensor | None, noise: Tensor, block_points: int, threads: int
     ) -> None:
         self.points, self.sources, self.index, self.count = points, sources, index, count
         self.noise, self.block_points, self.threads = noise, block_points, threads
@@ -136,9 +141,9 @@ class _Looking:
     def around(self, stage: Stage) -> tuple[Planes, Tensor]:
         """Tangent planes and first features (M, C) of all points."""
 
-        def look(_: slice, graph: Edges) -> tuple[Tensor, ...]:
+        def look(block: slice, graph: Edges) -> tuple[Tensor, ...]:
             plane = planes(graph)
-            return *plane, stage.embed(point_features(graph, plane, self.noise))
+            return *plane, stage.embed(point_features(graph, plane, self.noise[block]))
 
         normal, shape, known = self.over_blocks(look)
         return Planes(normal, shape), known
@@ -153,7 +158,7 @@ class _Looking:
 
             def exchange(block: slice, graph: Edges) -> tuple[Tensor, ...]:
                 mine = planes.block(block)
-                edge, a, b = self._features(graph, mine, planes)
+                edge, a, b = self._features(block, graph, mine, planes)
                 message, news = layer(edge, graph, before[block], heard)  # noqa: B023
                 on_block(block.stop - block.start)
                 return (news, stage.step(message, graph, mine, planes, a, b)) if last else (news,)  # noqa: B023
@@ -167,9 +172,9 @@ class _Looking:
         heard = [layer.hear(sources) for layer in stage.exchanges]
 
         def land(block: slice, graph: Edges) -> tuple[Tensor]:
-            mine = planes(graph)
-            features = stage.embed(point_features(graph, mine, self.noise))
-            edge, a, b = edge_features(graph, mine, theirs, self.noise)
+            mine, noise = planes(graph), self.noise[block]
+            features = stage.embed(point_features(graph, mine, noise))
+            edge, a, b = edge_features(graph, mine, theirs, noise)
             for layer, said in zip(stage.exchanges, heard, strict=True):
                 message, features = layer(edge, graph, features, said)
                 on_block(block.stop - block.start)
@@ -177,9 +182,9 @@ class _Looking:
 
         return self.over_blocks(land)[0]
 
-    def _features(self, graph: Edges, mine: Planes, theirs: Planes) -> tuple[Tensor, Tensor, Tensor]:
+    def _features(self, block: slice, graph: Edges, mine: Planes, theirs: Planes) -> tuple[Tensor, Tensor, Tensor]:
         if not self.in_one:
-            return edge_features(graph, mine, theirs, self.noise)
+            return edge_features(graph, mine, theirs, self.noise[block])
         if self._only_features is None:
             self._only_features = edge_features(graph, mine, theirs, self.noise)
         return self._only_features

@@ -6,6 +6,8 @@
 
 #include "../networks/geometry.h"
 
+#define MOST_DIRECTIONS 32
+
 typedef struct {
     const int32_t *index; /* (N, k) */
     int k;
@@ -13,6 +15,12 @@ typedef struct {
 
 INLINE void away(double *offset, const double *from, const double *to) {
     for (int axis = 0; axis < 3; axis++) offset[axis] = to[axis] - from[axis];
+}
+
+/* What is left of a vector in the plane across a unit normal. */
+INLINE void flatten(double *vector, const double *normal) {
+    const double height = dot(vector, normal);
+    for (int axis = 0; axis < 3; axis++) vector[axis] -= height * normal[axis];
 }
 
 /* Unit normals of the points in rows [start, stop), and from 0, no surface, to 1, a sheet. */
@@ -40,25 +48,48 @@ static ANY_PROCESSOR void tangents(const double *points, Graph graph, int64_t st
     }
 }
 
-/* Points one step further: repulsion in the tangent plane, faded where normals disagree and where there is no sheet. */
-static ANY_PROCESSOR void push(const double *points, const double *normals, const double *sheet, const double *spacing, Graph graph,
-                               int64_t start, int64_t stop, double pushing, double longest, double *pushed) {
+/* What bounds cells: `n` directions as n cosines and n sines; a cell without a bound within `open` spacings ends at `wall`. */
+typedef struct {
+    const double *waves;
+    int n;
+    double open, wall;
+} Directions;
+
+/* Points one step further: to the centre of their cell in the tangent plane, held by where they began. */
+static ANY_PROCESSOR void even(const double *points, const double *began, const double *normals, const double *sheet,
+                               const double *spacing, const double *held, Graph graph, Directions directions, int64_t start,
+                               int64_t stop, double *evened) {
     for (int64_t i = start; i < stop; i++) {
         const int32_t *row = graph.index + i * graph.k;
         const double *own = points + 3 * i, *upright = normals + 3 * i;
-        double sum[3] = {0, 0, 0};
+        double first[3], second[3], bound[MOST_DIRECTIONS] = {0}, area = 0, centre[2] = {0, 0}, back[3];
+        away(first, began + 3 * i, began + 3 * (size_t)row[1]);
+        flatten(first, upright);
+        const double length = larger64(sqrt(dot(first, first)), 1e-300);
+        for (int axis = 0; axis < 3; axis++) first[axis] /= length;
+        cross(second, upright, first);
         for (int j = 1; j < graph.k; j++) {
             double offset[3];
-            away(offset, points + 3 * (size_t)row[j], own);
-            const double distance = larger64(sqrt(dot(offset, offset)), 1e-300);
+            away(offset, own, points + 3 * (size_t)row[j]);
             const double cosine = dot(upright, normals + 3 * (size_t)row[j]);
-            const double weight = larger64(1 / distance - 1 / (pushing * spacing[i]), 0) * cosine * cosine * sheet[i];
-            for (int axis = 0; axis < 3; axis++) sum[axis] += spacing[i] * weight * offset[axis];
+            const double nearness = 2 * cosine * cosine / larger64(dot(offset, offset), 1e-300);
+            const double u = nearness * dot(offset, first), v = nearness * dot(offset, second);
+            for (int d = 0; d < directions.n; d++)
+                bound[d] = larger64(bound[d], u * directions.waves[d] + v * directions.waves[directions.n + d]);
         }
-        const double height = dot(sum, upright);
-        for (int axis = 0; axis < 3; axis++) sum[axis] -= height * upright[axis];
-        const double step = longest * spacing[i] / larger64(larger64(sqrt(dot(sum, sum)), spacing[i]), 1e-300);
-        for (int axis = 0; axis < 3; axis++) pushed[3 * i + axis] = own[axis] + step * sum[axis];
+        for (int d = 0; d < directions.n; d++) {
+            const int is_open = bound[d] * spacing[i] * directions.open <= 1;
+            const double radius = is_open ? directions.wall * spacing[i] : 1 / bound[d], squared = radius * radius;
+            area += squared;
+            centre[0] += squared * radius * directions.waves[d], centre[1] += squared * radius * directions.waves[directions.n + d];
+        }
+        away(back, own, began + 3 * i);
+        flatten(back, upright);
+        const double share = sheet[i] / (1 + held[i]), pull = 2. / 3 / larger64(area, 1e-300);
+        for (int axis = 0; axis < 3; axis++) {
+            const double to_centre = pull * (centre[0] * first[axis] + centre[1] * second[axis]);
+            evened[3 * i + axis] = own[axis] + share * (to_centre + held[i] * back[axis]);
+        }
     }
 }
 
@@ -118,18 +149,20 @@ static PyObject *call_tangents(PyObject *self, PyObject *args) {
     Py_RETURN_NONE;
 }
 
-static PyObject *call_push(PyObject *self, PyObject *args) {
+static PyObject *call_even(PyObject *self, PyObject *args) {
     Graph graph;
-    unsigned long long points, normals, sheet, spacing, pushed;
+    Directions directions;
+    unsigned long long points, began, normals, sheet, spacing, held, waves, evened;
     long long start, stop;
-    double pushing, longest;
     (void)self;
-    if (!PyArg_ParseTuple(args, "O&LLKKKKddK", graph_of, &graph, &start, &stop, &points, &normals, &sheet, &spacing, &pushing,
-                          &longest, &pushed))
+    if (!PyArg_ParseTuple(args, "O&LLKKKKKKKiddK", graph_of, &graph, &start, &stop, &points, &began, &normals, &sheet, &spacing,
+                          &held, &waves, &directions.n, &directions.open, &directions.wall, &evened))
         return NULL;
+    if (directions.n > MOST_DIRECTIONS) return PyErr_Format(PyExc_ValueError, "at most %d directions", MOST_DIRECTIONS);
+    directions.waves = AT(double, waves);
     Py_BEGIN_ALLOW_THREADS
-    push(AT(double, points), AT(double, normals), AT(double, sheet), AT(double, spacing), graph, start, stop, pushing, longest,
-         AT(double, pushed));
+    even(AT(double, points), AT(double, began), AT(double, normals), AT(double, sheet), AT(double, spacing), AT(double, held), graph,
+         directions, start, stop, AT(double, evened));
     Py_END_ALLOW_THREADS
     Py_RETURN_NONE;
 }
@@ -149,7 +182,7 @@ static PyObject *call_land(PyObject *self, PyObject *args) {
 
 static PyMethodDef functions[] = {
     {"tangents", call_tangents, METH_VARARGS, "Normals of some points, and how much of a sheet is there."},
-    {"push", call_push, METH_VARARGS, "Some points one step further apart."},
+    {"even", call_even, METH_VARARGS, "Some points one step nearer to the centres of their cells."},
     {"land", call_land, METH_VARARGS, "Some points back on the surface."},
     {NULL, NULL, 0, NULL},
 };

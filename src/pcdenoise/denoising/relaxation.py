@@ -24,8 +24,12 @@ else:
     IS_BUILT = True
 
 _NEIGHBOURS = 12
-_STEP = 0.35  # of the local spacing, at most, per step
-_PUSHING = 1.6  # local spacings: who is further away does not push
+_DIRECTIONS = 12
+_WAVES = np.stack([wave(2 * np.pi / _DIRECTIONS * np.arange(_DIRECTIONS)) for wave in (np.cos, np.sin)])
+_OPEN, _WALL = 1.15, 0.5
+"""Local spacings: a cell that would reach further lies at an open border, and ends so far away."""
+_HELD = 0.03
+"""Times (spacing / noise)²: of where a point was measured and what an even cloud asks for each has its weight."""
 _REACH_STDS = 1.0
 """How far a point may slide in all, in standard deviations of the noise: isotropic noise has displaced it by so much along
 the surface too, so a clean cloud stays as it is."""
@@ -37,24 +41,26 @@ _LOW_PASS_STD = 0.4 * 2**0.5  # of its radius, as released
 _LOW_PASS_POINTS = 256  # within its radius: more are thinned
 
 
-def relax(points: Points, noise_std: float, steps: int, threads: int = -1) -> Points:
+def relax(points: Points, noise_std: float | NDArray[np.float64], steps: int, threads: int = -1) -> Points:
     """Evens the spacing of (N, 3) finite, distinct points on a surface; row i stays row i, N < 4 comes back as it was.
 
-    Each step pushes a point away from neighbours that are nearer than the local mean, inside the tangent plane of its
-    neighbourhood; at the end all land on the surface again. Where that is no sheet (wires, volumes, corners) points stay, or
-    spreading them would change the shape. Neighbours are found once: the few that push are among the twelve nearest before
-    and after, since nobody slides past them.
+    noise_std: of the noise that brought them here, one for all or (N,) at each. Steps of Lloyd's algorithm, held back: each
+    point goes to the centre of its cell in the tangent plane, as far as it may have been displaced by noise; at the end all land
+    on the surface again. Where there is no sheet (wires, volumes, corners) points stay, or spreading them would change the shape.
+    Neighbours are found once: those that bound a cell are among the twelve nearest before and after.
     """
-    if len(points) <= 3 or noise_std <= 0 or steps == 0:
+    if len(points) <= 3 or steps == 0 or not np.any(noise_std):
         return points
     k = min(_NEIGHBOURS, len(points) - 1)
     distances, found = NeighbourSearch(points, threads).knn(points, k + 1)
     start = np.ascontiguousarray(points, np.float64)
-    sheet = (_Compiled if IS_BUILT else _Sheet)(start, found.astype(np.int32), distances[:, k] / np.sqrt(k / 2.5), threads)
+    spacing = distances[:, k] * np.sqrt(np.pi / k)
+    held = _HELD * (spacing / np.maximum(noise_std, 1e-9 * spacing)) ** 2
+    sheet = (_Compiled if IS_BUILT else _Sheet)(start, found.astype(np.int32), spacing, held, threads)
     del distances, found
     current = start
     for _ in range(steps):
-        current = within(_REACH_STDS * noise_std, start, sheet.pushed(current))
+        current = within(_REACH_STDS * noise_std, start, sheet.evened(current))
     return within(_REACH_STDS * noise_std, start, sheet.landed(current))
 
 
@@ -78,7 +84,8 @@ def without_low_frequencies(points: Points, moves: Points, radius: float, rng: n
 
 @dataclass
 class _Sheet:
-    """(N, 3) points with the rows of their neighbours (N, 1 + K), each point first, and their spacing (N,).
+    """(N, 3) points with the rows of their neighbours (N, 1 + K), each point first, their spacing (N,), and how strongly each is
+    held by its start (N,), in units of how strongly its cell's centre pulls.
 
     normal (N, 3); sheet (N,): from 0, no surface (a wire, a volume), to 1.
     """
@@ -86,16 +93,21 @@ class _Sheet:
     points: Points
     index: NDArray[np.int32]
     spacing: NDArray[np.float64]
+    held: NDArray[np.float64]
     threads: int
 
     def __post_init__(self) -> None:
         self.normal, self.sheet = np.empty_like(self.points), np.empty(len(self.points))
         each_block(self._look, len(self.points), self.threads, _BLOCK)
 
-    def pushed(self, current: Points) -> Points:
-        """(N, 3) points one step further: repulsion in the tangent plane, faded where normals disagree."""
+    def evened(self, current: Points) -> Points:
+        """(N, 3) points one step further: on the way to the centre of their cell in the tangent plane, and held by their start.
+
+        Along each of some directions the cell ends halfway to the neighbour that is met first, further where normals disagree.
+        Where none is near, at an open border, it ends where it would in an even cloud, so that borders stay.
+        """
         after = np.empty_like(current)
-        each_block(lambda rows: self._push(current, rows, after), len(current), self.threads, _BLOCK)
+        each_block(lambda rows: self._even(current, rows, after), len(current), self.threads, _BLOCK)
         return after
 
     def landed(self, current: Points) -> Points:
@@ -117,16 +129,26 @@ class _Sheet:
         self.normal[rows] = axes[:, :, 0]
         self.sheet[rows] = np.clip((planarity - _SHEET[0]) / (_SHEET[1] - _SHEET[0]), 0, 1)
 
-    def _push(self, current: Points, rows: slice, after: Points) -> None:
-        others, upright, reach = self.index[rows, 1:], self.normal[rows], self.spacing[rows, None]
-        away = current[rows, None] - current[others]
-        distance = np.maximum(np.linalg.norm(away, axis=2), 1e-300)
+    def _even(self, current: Points, rows: slice, after: Points) -> None:
+        others, upright = self.index[rows, 1:], self.normal[rows]
+        offset = current[others] - current[rows, None]
         agreement = np.einsum("mkc,mc->mk", self.normal[others], upright) ** 2
-        weight = np.maximum(1 / distance - 1 / (_PUSHING * reach), 0) * agreement * self.sheet[rows, None]
-        push = reach * np.einsum("mk,mkc->mc", weight, away)
-        push -= (push * upright).sum(axis=1, keepdims=True) * upright
-        longest = np.maximum(np.linalg.norm(push, axis=1, keepdims=True), reach)
-        after[rows] = current[rows] + _STEP * reach / np.maximum(longest, 1e-300) * push
+        nearness = 2 * agreement / np.maximum((offset**2).sum(axis=2), 1e-300)
+        first = self.points[self.index[rows, 1]] - self.points[rows]
+        first -= (first * upright).sum(axis=1, keepdims=True) * upright
+        first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-300)
+        second = np.cross(upright, first)
+        along = (nearness * np.einsum("mkc,mc->mk", offset, axis) for axis in (first, second))
+        shares = sum(side[:, :, None] * wave for side, wave in zip(along, _WAVES, strict=True))
+        ends, spacing = np.maximum(shares.max(axis=1), 1e-300), self.spacing[rows, None]
+        radius = np.where(ends * spacing * _OPEN > 1, 1 / ends, _WALL * spacing)
+        third, area = 2 / 3 * radius**3, (radius**2).sum(axis=1)
+        to_centre = sum(
+            ((third * wave).sum(axis=1) / area)[:, None] * axis for wave, axis in zip(_WAVES, (first, second), strict=True)
+        )
+        back, held = self.points[rows] - current[rows], self.held[rows, None]
+        back -= (back * upright).sum(axis=1, keepdims=True) * upright
+        after[rows] = current[rows] + self.sheet[rows, None] * (to_centre + held * back) / (1 + held)
 
     def _land(self, current: Points, rows: slice, after: Points) -> None:
         offset, theirs = self.points[self.index[rows]] - current[rows, None], self.normal[self.index[rows]]
@@ -146,9 +168,9 @@ class _Compiled(_Sheet):
         given = (self._graph, rows.start, rows.stop, _at(self.points))
         _relaxation.tangents(*given, *_SHEET, _at(self.normal), _at(self.sheet))
 
-    def _push(self, current: Points, rows: slice, after: Points) -> None:
-        given = (self._graph, rows.start, rows.stop, _at(current), _at(self.normal), _at(self.sheet), _at(self.spacing))
-        _relaxation.push(*given, _PUSHING, _STEP, _at(after))
+    def _even(self, current: Points, rows: slice, after: Points) -> None:
+        given = (self._graph, rows.start, rows.stop, _at(current), _at(self.points), _at(self.normal), _at(self.sheet))
+        _relaxation.even(*given, _at(self.spacing), _at(self.held), _at(_WAVES), _DIRECTIONS, _OPEN, _WALL, _at(after))
 
     def _land(self, current: Points, rows: slice, after: Points) -> None:
         given = (self._graph, rows.start, rows.stop, _at(current), _at(self.points), _at(self.normal), _at(self.sheet))

@@ -16,6 +16,7 @@ from pcdenoise.cloud.scan import Points
 
 _APART = {1: 0.52, 2: 0.39, 3: 0.31, 5: 0.23}
 """Share of candidates that remain when none may be among the so many nearest of another (measured)."""
+_MOST_MORE = 1.5
 _LANDSCAPE = 11.0
 """Neighbourhoods hold 11·√(points that show the surface) raw points: the balance of noise, which asks for all of them, and of
 curvature, which asks for few (measured on shapes that serve for nothing else)."""
@@ -29,6 +30,10 @@ class Seeds:
     count: NDArray[np.float64]
     cell: Indices
 
+    def means(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(M,) mean of (N,) values of the raw points in each seed's cell."""
+        return np.bincount(self.cell, weights=values, minlength=len(self.points)) / self.count
+
 
 def share_of_seeds(level: NoiseLevel, neighbours: int) -> float:
     """Seeds per raw point, so that those the network looks at stand for the right number of raw points; 1 for little noise."""
@@ -37,16 +42,27 @@ def share_of_seeds(level: NoiseLevel, neighbours: int) -> float:
     return min(share, densest) if share < 1.5 * densest else 1.0
 
 
-def coarsen(points: Points, share: float, seed: int = 0, threads: int = -1, identity: Identity | None = None) -> Seeds:
+def coarsen(
+    points: Points,
+    share: float,
+    seed: int = 0,
+    threads: int = -1,
+    identity: Identity | None = None,
+    noisier: NDArray[np.float64] | None = None,
+) -> Seeds:
     """About share * N seeds of (N, 3) finite points in spatial order, spread evenly relative to the local density.
 
     identity (N,): what to draw by in place of the coordinates, for points whose last bits depend on how they were computed.
+    noisier (N,): how many times noisier than the whole each place is. Seeds are so many times fewer there, and a place with
+    little noise has at most _MOST_MORE times the share.
     Candidates are drawn by hash; those that are first among their nearest candidates stay, round by round; every raw point
     then joins its nearest seed. Averaging inside the cells keeps the statistical weight of every raw point.
     """
-    apart = max((n for n, left in _APART.items() if left >= share), default=1)
+    most = share if noisier is None else min(_MOST_MORE * share, max(_APART.values()))
+    apart = max((n for n, left in _APART.items() if left >= most), default=1)
     drawn = drawn_by(coordinate_hash(points, 0) if identity is None else identity, seed)
-    is_candidate = drawn < np.uint64(min(share / _APART[apart], 1.0) * float(2**64 - 2**11))
+    shares = np.full(len(points), share) if noisier is None else np.minimum(share / noisier, most)
+    is_candidate = drawn < (np.minimum(shares / _APART[apart], 1.0) * float(2**64 - 2**11)).astype(np.uint64)
     candidates = points[is_candidate]
     if len(candidates) <= apart + 1:
         return Seeds(points, np.ones(len(points)), np.arange(len(points)))

@@ -9,13 +9,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pcdenoise.cloud.neighbours import coordinate_hash, knn, spatial_order
-from pcdenoise.cloud.noise_level import estimate
+from pcdenoise.cloud.noise_level import by_place, estimate
 from pcdenoise.denoising.seeds import coarsen, share_of_seeds
 from pcdenoise.learning.ahead import CloudsAhead
 from pcdenoise.synthesis import noise
@@ -30,13 +31,13 @@ N_RAW = 48_000
 N_LANDING = 4_000
 """Most seeds, raw points and landing points of one training cloud; larger ones are cut to a ball."""
 _LAWS = {
-    "gaussian": 0.64,
-    "rays": 0.08,
+    "gaussian": 0.5,
+    "rays": 0.11,
     "heavy-tailed": 0.1,
-    "laplace": 0.04,
-    "anisotropic": 0.06,
-    "beam-bias": 0.04,
-    "quantised": 0.04,
+    "laplace": 0.07,
+    "anisotropic": 0.08,
+    "beam-bias": 0.08,
+    "quantised": 0.06,
 }
 """How often each law of noise is met."""
 
@@ -67,7 +68,8 @@ class TrainingCloud:
 
     seeds (M, 3), count (M,); raw (F, 3): points that land on the seeds. Where every point is its own seed, both are None.
     seed_judged (M,): seeds of the surface, far enough from the cut. judged, clutter (F,): final points far enough from the cut,
-    and those that belong to no surface and should stay. noise: estimated standard deviation; scale: what errors are divided by.
+    and those that belong to no surface and should stay. noise: estimated standard deviation, noise_at_seeds (M,) and noise_at_raw
+    (F,) what it is there; scale: what errors are divided by.
     surface: what predictions are held to, if anybody knows it; covered (C, 3), covered_normals (C, 3): samples of it that final
     points should come close to, else none. held_out (H, 3): noisy points that the network does not see, else none.
     """
@@ -79,11 +81,18 @@ class TrainingCloud:
     judged: Mask
     clutter: Mask
     noise: float
+    noise_at_seeds: Array
+    noise_at_raw: Array | None
     scale: float
     surface: Surface | None
     covered: Array
     covered_normals: Array
     held_out: Array
+
+    @property
+    def given(self) -> tuple[Array, Array | None, Array | None, Array, Array | None]:
+        """What `pyramid.descend` takes."""
+        return self.seeds, self.count, self.raw, self.noise_at_seeds, self.noise_at_raw
 
     @property
     def n_points(self) -> int:
@@ -190,17 +199,19 @@ def _prepared(
     held_out: Array | None = None,
 ) -> TrainingCloud:
     """Seeds and landing points of (N, 3) noisy points, cut to a ball of what fits one step. std: 0 where nobody knows it."""
+    order = spatial_order(noisy)
+    noisy, clutter = noisy[order], clutter[order]
     level = estimate(noisy, threads=1)
     share = share_of_seeds(level, neighbours) * float(np.exp(0.15 * rng.standard_normal()))
     share = min(share, 1.0)
     limit = N_SEEDS if share == 1 else min(N_RAW, int(N_SEEDS / share))
+    around = by_place(noisy, coordinate_hash(noisy, 0), level, threads=1)
     centre = noisy[rng.choice(np.flatnonzero(~clutter))]
     distance = np.linalg.norm(noisy - centre, axis=1)
     cut = len(noisy) > limit
     radius = float(np.partition(distance, limit)[limit]) if cut else np.inf
     kept = np.flatnonzero(distance < radius)
-    kept = kept[spatial_order(noisy[kept])]
-    noisy, clutter = noisy[kept], clutter[kept]
+    noisy, clutter, around = noisy[kept], clutter[kept], around[kept]
 
     def inside(points: Array, share: float = 0.75) -> Mask:
         within: Mask = np.linalg.norm(points - centre, axis=1) < share * radius
@@ -213,19 +224,24 @@ def _prepared(
         near = np.linalg.norm(surface.points - centre, axis=1) < radius + 0.2
         surface = replace(surface, points=surface.points[near], normals=surface.normals[near], residual=None)
     held_out = np.zeros((0, 3)) if held_out is None else held_out[inside(held_out, 1.0)]
-    estimated = level.std * float(np.exp(0.1 * rng.standard_normal()))
+    misread = float(np.exp(0.1 * rng.standard_normal()))
     scale = max(std, 0.5 * level.std if std else level.std, 0.1 * level.spacing, 1e-6)
-    known = estimated, scale, surface, covered, covered_normals, held_out
+    made = partial(
+        TrainingCloud, noise=misread * level.std, scale=scale,
+        surface=surface, covered=covered, covered_normals=covered_normals, held_out=held_out,
+    )  # fmt: skip
     if share == 1:
         judged = inside(noisy)
-        return TrainingCloud(noisy, None, None, judged & ~clutter, judged, clutter, *known)
-    seeds = coarsen(noisy, share, seed=int(rng.integers(2**31)), threads=1)
+        return made(noisy, None, None, judged & ~clutter, judged, clutter, noise_at_seeds=misread * around, noise_at_raw=None)
+    noisier = around / max(level.std, 1e-300)
+    seeds = coarsen(noisy, share, seed=int(rng.integers(2**31)), threads=1, noisier=noisier)
     seed_judged = inside(seeds.points)
     if clutter.any():
         seed_judged &= cKDTree(noisy[clutter]).query(seeds.points)[0] > 2 * level.spacing
     landing = np.sort(rng.permutation(np.flatnonzero(inside(noisy)))[:N_LANDING])
     judged = np.ones(len(landing), dtype=bool)
-    return TrainingCloud(seeds.points, seeds.count, noisy[landing], seed_judged, judged, clutter[landing], *known)
+    given = seeds.points, seeds.count, noisy[landing], seed_judged, judged, clutter[landing]
+    return made(*given, noise_at_seeds=misread * seeds.means(around), noise_at_raw=misread * around[landing])
 
 
 def _sampling(surface: Array, n_points: int, rng: np.random.Generator) -> NDArray[np.int64]:

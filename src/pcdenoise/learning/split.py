@@ -31,7 +31,7 @@ def split_loss(network: ProjectionNetwork, cloud: TrainingCloud) -> tuple[Tensor
     that the expected loss is the squared error plus the fit's variance, whatever the network does; the quadric takes curvature
     off, and what is left of it is the -Hσ² of every fit to points that also err along the surface.
     """
-    run = descend(network, cloud.seeds, cloud.count, cloud.raw, cloud.noise, block_points=10**9, threads=1)
+    run = descend(network, *cloud.given, block_points=10**9, threads=1)
     steps = [points.float() for points in run.seeds]
     final = steps[-1] if run.landed is None else run.landed.float()
     target, loss = HeldOut(cloud.held_out, cloud.noise), torch.zeros(())

@@ -35,7 +35,7 @@ class NearestSurface:
 def supervised_loss(network: ProjectionNetwork, cloud: TrainingCloud) -> tuple[Tensor, Tensor]:
     """Loss to descend and the final mean squared error, both relative to the noise of the cloud, whose surface is known."""
     assert cloud.surface is not None
-    run = descend(network, cloud.seeds, cloud.count, cloud.raw, cloud.noise, block_points=10**9, threads=1)
+    run = descend(network, *cloud.given, block_points=10**9, threads=1)
     steps = [points.float() for points in run.seeds]
     target, loss = NearestSurface(cloud.surface), torch.zeros(())
     for points in steps if run.landed is not None else steps[:-1]:

@@ -24,8 +24,8 @@ typedef struct {
     const double *points, *sources; /* (M, 3), (N, 3) */
     const int32_t *index;           /* (M, k): rows of each point's sources */
     const float *count;             /* (N,), or none */
+    const float *noise;             /* (M,) */
     int k;
-    float noise;
 } Surroundings;
 
 typedef struct {
@@ -142,7 +142,7 @@ static ANY_PROCESSOR void look(const Surroundings *around, int64_t start, int64_
         plane(&near, normals + 3 * i, shape);
         if (!embedding) continue;
         const float thin = shape[0] / near.scale, middle = shape[1] / near.scale, wide = shape[2] / near.scale;
-        const float level = around->noise / near.scale;
+        const float level = around->noise[i] / near.scale;
         const float known[POINT_FEATURES] = {2 * thin, 2 * (wide - middle), 4 * level / (1 + level), thin / (thin + level + 1e-6f)};
         store(features + CHANNELS * i, layer(load(embedding->bias), known, POINT_FEATURES, embedding->weight[0]));
     }
@@ -269,7 +269,7 @@ static ANY_PROCESSOR void talk(const Surroundings *around, int64_t start, int64_
         const int32_t *row = around->index + i * around->k;
         float own[CHANNELS];
         neighbourhood(&near, around, i);
-        edges(&edge, &near, normals + 3 * i, their_normals, row, around->noise);
+        edges(&edge, &near, normals + 3 * i, their_normals, row, around->noise[i]);
         memcpy(own, before + CHANNELS * i, sizeof own);
         for (int r = 0; r < n_rounds; r++) exchange(rounds + r, &near, &edge, row, heard + r * n_heard, own, messages);
         memcpy(features + CHANNELS * i, own, sizeof own);
@@ -287,11 +287,12 @@ static ANY_PROCESSOR void hear(const float *features, int64_t start, int64_t sto
 /* For Python, which gives arrays by their addresses (fused.py) and lets other threads go on meanwhile. */
 
 static int surroundings(PyObject *given, void *into) {
-    unsigned long long points, sources, index, count;
+    unsigned long long points, sources, index, count, noise;
     Surroundings *around = into;
-    if (!PyArg_ParseTuple(given, "KKKKif", &points, &sources, &index, &count, &around->k, &around->noise)) return 0;
+    if (!PyArg_ParseTuple(given, "KKKKiK", &points, &sources, &index, &count, &around->k, &noise)) return 0;
     around->points = AT(double, points), around->sources = AT(double, sources);
     around->index = AT(int32_t, index), around->count = AT(float, count);
+    around->noise = AT(float, noise);
     return 1;
 }
 

@@ -30,6 +30,8 @@ CHANNELS, MOST_NEIGHBOURS = 32, 64
 """What the compiled code is made for."""
 
 Values = NDArray[np.float32]
+Noise = float | NDArray[np.float64]
+"""Standard deviation of the noise at each of some points (M,), or one for all."""
 
 
 def fits(sizes: ProjectionSettings) -> bool:
@@ -66,13 +68,14 @@ def _stage(weights: Weights, name: str, n_rounds: int) -> _Stage:
 
 @dataclass(frozen=True)
 class _Surroundings:
-    """M points that look at K sources each: points (M, 3), sources (N, 3), index (M, K), count (N,) or None."""
+    """M points that look at K sources each: points (M, 3), sources (N, 3), index (M, K), count (N,) or None;
+    noise (M,)."""
 
     points: Points
     sources: Points
     index: NDArray[np.int32]
     count: Values | None
-    noise: float
+    noise: Values
     over: Callable[[Callable[[slice], None], int], None]
     on_block: Callable[[int], None]
 
@@ -121,7 +124,7 @@ class _Surroundings:
     @property
     def _given(self) -> _fused.Surroundings:
         places = address(self.points, np.float64), address(self.sources, np.float64)
-        return *places, address(self.index, np.int32), _at(self.count), self.index.shape[1], self.noise
+        return *places, address(self.index, np.int32), _at(self.count), self.index.shape[1], _at(self.noise)
 
 
 def descend(
@@ -130,7 +133,8 @@ def descend(
     seeds: Points,
     count: NDArray[np.float64] | None,
     raw: Points | None,
-    noise: float,
+    noise: Noise,
+    raw_noise: Noise | None = None,
     *,
     block_points: int = BLOCK_POINTS,
     threads: int = 1,
@@ -151,8 +155,9 @@ def descend(
     def nearest(points: Points, sources: Points) -> NDArray[np.int32]:
         return NeighbourSearch(sources, threads).nearest(points, sizes.neighbours)
 
-    def looking(points: Points, sources: Points, index: NDArray[np.int32]) -> _Surroundings:
-        return _Surroundings(points, sources, index, behind, noise, over, on_block)
+    def looking(points: Points, sources: Points, index: NDArray[np.int32], noise: Noise = noise) -> _Surroundings:
+        everywhere = np.ascontiguousarray(np.broadcast_to(np.float32(noise), len(points)))
+        return _Surroundings(points, sources, index, behind, everywhere, over, on_block)
 
     points = np.ascontiguousarray(seeds, np.float64)
     stages = [_stage(weights, f"stages.{number}", n_rounds) for number, n_rounds in enumerate(sizes.rounds)]
@@ -174,7 +179,7 @@ def descend(
         return points, shape
     theirs, _, _ = looking(points, points, index).around(None)
     landing, stage = np.ascontiguousarray(raw, np.float64), _stage(weights, "landing", sizes.landing_rounds)
-    on_seeds = looking(landing, points, nearest(landing, points))
+    on_seeds = looking(landing, points, nearest(landing, points), noise if raw_noise is None else raw_noise)
     mine, _, known = on_seeds.around(stage)
     _, moves = on_seeds.told(stage.rounds, stage.head, (mine, theirs), on_seeds.hear(stage.hearing, features), known)
     return checked_finite(landing + moves), shape
