@@ -112,7 +112,7 @@ def test_another_seed_looks_at_other_places_and_finds_about_the_same() -> None:
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 15])
 def test_fewer_than_sixteen_distinct_points_show_no_noise_and_no_surface(n: int) -> None:
     points = np.column_stack([np.arange(n) * 3.0, np.zeros((n, 2))])
-    assert estimate(np.repeat(points, 9, axis=0), threads=1) == NoiseLevel(0.0, 3.0 if n > 1 else 0.0, 16.0, False)
+    assert estimate(np.repeat(points, 9, axis=0), threads=1) == NoiseLevel(0.0, 3.0 if n > 1 else 0.0, 16.0, False, n_points=n)
 
 
 def test_flat_straight_and_coincident_points_have_no_noise(rng: np.random.Generator) -> None:

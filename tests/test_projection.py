@@ -23,7 +23,7 @@ from pcdenoise.networks.projection import (
 )
 
 K = 24
-NOISE = 0.05
+NOISE = torch.tensor(0.05)
 
 
 def graph_of(points: np.ndarray, k: int = K, count: Tensor | None = None) -> Edges:
@@ -186,7 +186,7 @@ def test_offsets_and_weights_know_no_unit(rng: np.random.Generator) -> None:
 def test_coincident_points_give_numbers() -> None:
     graph = graph_of(np.zeros((30, 3)))
     own = planes(graph)
-    for values in (graph.weight, graph.offset, own.normal, own.shape, edge_features(graph, own, own, 0.0)[0]):
+    for values in (graph.weight, graph.offset, own.normal, own.shape, edge_features(graph, own, own, torch.tensor(0.0))[0]):
         assert torch.isfinite(values).all()
 
 

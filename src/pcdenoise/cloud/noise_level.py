@@ -36,8 +36,11 @@ _CERTAIN_ASPECT, _SMALL_SHARE = 4.4, 1 / 40
 once a neighbourhood is half of them."""
 _CLEARER_SHARE = 0.3  # this share of all places must show it: edges and thin parts stay thick at any scale
 _SEEN = ([3.0, 3.7, 4.1, 4.7, 5.2, 6.1, 8.0], [0.72, 0.82, 0.86, 0.9, 0.92, 0.94, 0.95])
-_POINTS_PER_PLACE, _PLACES_AROUND, _PLACES_SEED = 32, 12, 5
-"""Noise by place is read at one point in so many, and is a mean over so many readings."""
+_POINTS_PER_PLACE, _POINTS_AROUND, _PLACES_SEED = 32, 384, 5
+"""Noise by place is read at one point in so many, at N_PROBES at least, and is a mean over the places of so many points."""
+_PLACES_FROM, _PLACES_IN_FULL = 1.0, 4.0
+"""Points within the scale of the noise at which places begin to count, and count in full: where there are few, the smallest
+neighbourhood is much larger than that scale, and what it leaves may be curvature."""
 _ENOUGH = 48  # points tell what a neighbourhood of any size leaves: of larger ones a share is drawn
 MOST_TIMES = 2.5
 """Noise by place is within so many times that of the whole cloud."""
@@ -50,7 +53,7 @@ class NoiseLevel:
 
     scale_points: how many nearest points show a surface rather than a ball of noise; it grows as std² times density.
     is_surface: whether any scale shows one (False: vegetation, clutter, a filled volume).
-    is_known: whether somebody told the std.
+    is_known: whether somebody told the std. n_points: distinct points of the cloud that it was read from.
     """
 
     std: float
@@ -58,6 +61,7 @@ class NoiseLevel:
     scale_points: float
     is_surface: bool
     is_known: bool = False
+    n_points: int = 0
 
 
 def estimate(points: Points, seed: int = 0, threads: int = -1, known_std: float | None = None) -> NoiseLevel:
@@ -99,11 +103,11 @@ def estimate_from(probed: Points, n_points: int, nearest: Nearest, known_std: fl
     """`estimate` at (M, 3) probes of a cloud that only `nearest` knows; it is asked for up to 2048 neighbours."""
     is_known = known_std is not None
     if n_points < 2:
-        return NoiseLevel(known_std or 0.0, 0.0, float(_LADDER[0]), False, is_known)
+        return NoiseLevel(known_std or 0.0, 0.0, float(_LADDER[0]), False, is_known, n_points)
     probed = probed[spatial_order(probed)]
     spacing = float(np.median(nearest(probed, 2)[0][:, 1]))
     if n_points < _LADDER[0]:
-        return NoiseLevel(known_std or 0.0, spacing, float(_LADDER[0]), False, is_known)
+        return NoiseLevel(known_std or 0.0, spacing, float(_LADDER[0]), False, is_known, n_points)
 
     rungs: list[_Rung] = []
     for k in (k for k in _LADDER if k <= n_points):
@@ -119,10 +123,10 @@ def estimate_from(probed: Points, n_points: int, nearest: Nearest, known_std: fl
     shown = [rung for rung in rungs if rung.aspect >= _SURFACE_ASPECT]
     if not shown:
         std = known_std or max(rungs, key=lambda rung: rung.aspect).std
-        return NoiseLevel(std, spacing, float(_LADDER[0]), False, is_known)
+        return NoiseLevel(std, spacing, float(_LADDER[0]), False, is_known, n_points)
     std = known_std or shown[0].std
     certain = shown[0].k <= _SMALL_SHARE * n_points or max(rung.aspect for rung in shown) >= _CERTAIN_ASPECT
-    return NoiseLevel(std, spacing, _points_within(_SCALE_STDS * std, rungs), certain, is_known)
+    return NoiseLevel(std, spacing, _points_within(_SCALE_STDS * std, rungs), certain, is_known, n_points)
 
 
 def around(points: Points, level: NoiseLevel, at: Points | None = None, seed: int = 0, threads: int = -1) -> NDArray[np.float64]:
@@ -136,7 +140,7 @@ def around(points: Points, level: NoiseLevel, at: Points | None = None, seed: in
     places, std = _readings(cloud, drawn_by(coordinate_hash(cloud, 0), seed), level, threads)
     if not len(places):
         return np.full(len(at), np.nan)
-    return _spread(places, std, at, threads)
+    return _spread(places, std, at, level, threads)
 
 
 def by_place(points: Points, identity: Identity, level: NoiseLevel, threads: int = -1) -> NDArray[np.float64]:
@@ -151,8 +155,10 @@ def by_place(points: Points, identity: Identity, level: NoiseLevel, threads: int
     places, std = _readings(points, drawn_by(identity, _PLACES_SEED), level, threads)
     if not len(places):
         return everywhere
-    std = np.where(np.isnan(std), level.std, std)
-    return _spread(places, np.clip(std, level.std / MOST_TIMES, level.std * MOST_TIMES), points, threads)
+    times = np.clip(np.where(np.isnan(std), 1.0, std / level.std), 1 / MOST_TIMES, MOST_TIMES)
+    share = np.clip((level.scale_points - _PLACES_FROM) / (_PLACES_IN_FULL - _PLACES_FROM), 0, 1)
+    noise: NDArray[np.float64] = level.std * _spread(places, times, points, level, threads) ** share
+    return noise
 
 
 def _readings(points: Points, drawn: NDArray[np.uint64], level: NoiseLevel, threads: int) -> tuple[Points, NDArray[np.float64]]:
@@ -161,41 +167,53 @@ def _readings(points: Points, drawn: NDArray[np.uint64], level: NoiseLevel, thre
     Neighbourhoods grow from the cloud's own scale until they show a surface, and hold what a quadric leaves in them; NaN where
     none does. Of large ones a share of the points is looked at.
     """
-    kept = np.uint64(int(float(2**64 - 2**11) * min(1.0, _ENOUGH / level.scale_points)))
-    few = drawn <= kept
-    places, cloud = points[drawn <= kept // np.uint64(_POINTS_PER_PLACE)], points[few]
-    if len(cloud) < _LADDER[0] or not len(places):
-        return places[:0], np.empty(0)
-    search = NeighbourSearch(cloud, threads)
+    looked_at = min(1.0, _ENOUGH / level.scale_points)
+    cloud = points[drawn <= _threshold(looked_at)]
+    places = points[drawn <= _threshold(looked_at * _share_of_places(level, looked_at))]
     std = np.full(len(places), np.nan)
+    if len(cloud) < _LADDER[0] or not len(places):
+        return places, std
+    search = NeighbourSearch(cloud, threads)
     first = int(np.clip(level.scale_points, _LADDER[1], _ENOUGH))
-    for k in (min(times * first, len(cloud)) for times in (1, 2, 4)):
+    most = max(first, round(looked_at * level.n_points / 4))
+    for k in (min(times * first, most, len(cloud)) for times in (1, 2, 4)):
         for block in np.array_split(np.flatnonzero(np.isnan(std)), max(1, len(places) * k // _PROBED)):
             distances, indices = search.knn(places[block], k)
             radius = np.maximum(distances[:, -1], 1e-300)
             aspect = 1 / np.maximum(_quadric_residual(cloud[indices], places[block], radius), 1e-6)
-            shown = aspect >= _SURFACE_ASPECT
+            shown = aspect >= (_SURFACE_ASPECT if level.is_surface else _CERTAIN_ASPECT)
             std[block[shown]] = (radius / aspect)[shown] / np.interp(aspect[shown], *_SEEN)
     return places, std
 
 
-def _spread(places: Points, std: NDArray[np.float64], at: Points, threads: int) -> NDArray[np.float64]:
+def _threshold(share: float) -> np.uint64:
+    """Of random numbers a share is at most so large."""
+    return np.uint64(share * float(2**64 - 2**11))
+
+
+def _share_of_places(level: NoiseLevel, looked_at: float = 1.0) -> float:
+    """Places per point that is looked at."""
+    return min(1.0, max(1 / _POINTS_PER_PLACE, N_PROBES / max(1.0, looked_at * level.n_points)))
+
+
+def _spread(places: Points, std: NDArray[np.float64], at: Points, level: NoiseLevel, threads: int) -> NDArray[np.float64]:
     """(M,) noise around (M, 3) points: each of the (P, 3) places takes the mean of its neighbours, then points that of places.
 
-    Means are geometric: single readings scatter by factors. NaN where nothing was read at any of those places.
+    Means are geometric: single readings scatter by factors. NaN where nothing was read at most of those places.
     """
+    search = NeighbourSearch(places, threads)
 
     def mean(at: Points, k: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
         distances, index = search.knn(at, k)
         weight = 1 - 0.99 * (distances / np.maximum(distances[:, -1:], 1e-300)) ** 2
-        weight = weight * ~np.isnan(values[index])
-        with np.errstate(invalid="ignore"):
-            averaged: NDArray[np.float64] = (weight * np.nan_to_num(values[index])).sum(axis=1) / weight.sum(axis=1)
-        return averaged
+        known = weight * ~np.isnan(values[index])
+        share = known.sum(axis=1)
+        averaged = (known * np.nan_to_num(values[index])).sum(axis=1) / np.maximum(share, 1e-300)
+        return np.where(share >= 0.5 * weight.sum(axis=1), averaged, np.nan)
 
-    search = NeighbourSearch(places, threads)
-    logarithm = np.log(np.maximum(std, 1e-300))
-    return np.exp(mean(at, 3, mean(places, _PLACES_AROUND, logarithm)))
+    looked_at = min(1.0, _ENOUGH / level.scale_points)
+    around = round(_POINTS_AROUND * _share_of_places(level, looked_at))
+    return np.exp(mean(at, 3, mean(places, around, np.log(np.maximum(std, 1e-300)))))
 
 
 def _points_within(radius: float, rungs: list[_Rung]) -> float:

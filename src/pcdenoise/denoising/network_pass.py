@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pcdenoise.cloud.neighbours import Identity
 from pcdenoise.cloud.noise_level import NoiseLevel, by_place
 from pcdenoise.cloud.scan import Points
-from pcdenoise.denoising.seeds import coarsen, share_of_seeds
+from pcdenoise.denoising.seeds import coarsen, share_of_seeds, times_noisier
 from pcdenoise.networks import fused
 from pcdenoise.networks.store import Model, ProjectionSettings
 
@@ -42,7 +42,7 @@ def projection(
     noise = by_place(points, identity, level, threads)
     seeds, count, cell, raw, seed_noise = points, None, np.arange(len(points)), None, noise
     if share < 1:
-        coarse = coarsen(points, share, seed, threads, identity, noise / level.std)
+        coarse = coarsen(points, share, seed, threads, identity, times_noisier(noise, level, sizes.neighbours))
         seeds, count, cell, raw, seed_noise = coarse.points, coarse.count, coarse.cell, points, coarse.means(noise)
     total = len(seeds) * sum(sizes.rounds) + (len(points) * sizes.landing_rounds if share < 1 else 0)
     done, counting = 0, Lock()

@@ -48,11 +48,11 @@ static ANY_PROCESSOR void tangents(const double *points, Graph graph, int64_t st
     }
 }
 
-/* What bounds cells: `n` directions as n cosines and n sines; a cell without a bound within `open` spacings ends at `wall`. */
+/* What bounds cells: `n` directions as n cosines and n sines; a cell with none within open[0] spacings begins to end at `wall`. */
 typedef struct {
     const double *waves;
     int n;
-    double open, wall;
+    double open[2], wall;
 } Directions;
 
 /* Points one step further: to the centre of their cell in the tangent plane, held by where they began. */
@@ -78,8 +78,9 @@ static ANY_PROCESSOR void even(const double *points, const double *began, const 
                 bound[d] = larger64(bound[d], u * directions.waves[d] + v * directions.waves[directions.n + d]);
         }
         for (int d = 0; d < directions.n; d++) {
-            const int is_open = bound[d] * spacing[i] * directions.open <= 1;
-            const double radius = is_open ? directions.wall * spacing[i] : 1 / bound[d], squared = radius * radius;
+            const double furthest = directions.open[1] * spacing[i], reach = bound[d] * furthest > 1 ? 1 / bound[d] : furthest;
+            const double is_open = larger64(reach - directions.open[0] * spacing[i], 0) / (furthest - directions.open[0] * spacing[i]);
+            const double radius = reach + is_open * (directions.wall * spacing[i] - reach), squared = radius * radius;
             area += squared;
             centre[0] += squared * radius * directions.waves[d], centre[1] += squared * radius * directions.waves[directions.n + d];
         }
@@ -155,8 +156,8 @@ static PyObject *call_even(PyObject *self, PyObject *args) {
     unsigned long long points, began, normals, sheet, spacing, held, waves, evened;
     long long start, stop;
     (void)self;
-    if (!PyArg_ParseTuple(args, "O&LLKKKKKKKiddK", graph_of, &graph, &start, &stop, &points, &began, &normals, &sheet, &spacing,
-                          &held, &waves, &directions.n, &directions.open, &directions.wall, &evened))
+    if (!PyArg_ParseTuple(args, "O&LLKKKKKKKidddK", graph_of, &graph, &start, &stop, &points, &began, &normals, &sheet, &spacing,
+                          &held, &waves, &directions.n, directions.open, directions.open + 1, &directions.wall, &evened))
         return NULL;
     if (directions.n > MOST_DIRECTIONS) return PyErr_Format(PyExc_ValueError, "at most %d directions", MOST_DIRECTIONS);
     directions.waves = AT(double, waves);

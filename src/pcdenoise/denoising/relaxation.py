@@ -26,8 +26,9 @@ else:
 _NEIGHBOURS = 12
 _DIRECTIONS = 12
 _WAVES = np.stack([wave(2 * np.pi / _DIRECTIONS * np.arange(_DIRECTIONS)) for wave in (np.cos, np.sin)])
-_OPEN, _WALL = 1.15, 0.5
-"""Local spacings: a cell that would reach further lies at an open border, and ends so far away."""
+_OPEN, _WALL = (1.0, 1.4), 0.5
+"""Local spacings: a cell that reaches further than the first is taken for one at an open border, in full from the second on, and
+ends as far off as it would in an even cloud."""
 _HELD = 0.03
 """Times (spacing / noise)²: of where a point was measured and what an even cloud asks for each has its weight."""
 _REACH_STDS = 1.0
@@ -141,7 +142,9 @@ class _Sheet:
         along = (nearness * np.einsum("mkc,mc->mk", offset, axis) for axis in (first, second))
         shares = sum(side[:, :, None] * wave for side, wave in zip(along, _WAVES, strict=True))
         ends, spacing = np.maximum(shares.max(axis=1), 1e-300), self.spacing[rows, None]
-        radius = np.where(ends * spacing * _OPEN > 1, 1 / ends, _WALL * spacing)
+        radius = np.minimum(1 / ends, _OPEN[1] * spacing)
+        is_open = np.maximum((radius / spacing - _OPEN[0]) / (_OPEN[1] - _OPEN[0]), 0)
+        radius += is_open * (_WALL * spacing - radius)
         third, area = 2 / 3 * radius**3, (radius**2).sum(axis=1)
         to_centre = sum(
             ((third * wave).sum(axis=1) / area)[:, None] * axis for wave, axis in zip(_WAVES, (first, second), strict=True)
@@ -170,7 +173,7 @@ class _Compiled(_Sheet):
 
     def _even(self, current: Points, rows: slice, after: Points) -> None:
         given = (self._graph, rows.start, rows.stop, _at(current), _at(self.points), _at(self.normal), _at(self.sheet))
-        _relaxation.even(*given, _at(self.spacing), _at(self.held), _at(_WAVES), _DIRECTIONS, _OPEN, _WALL, _at(after))
+        _relaxation.even(*given, _at(self.spacing), _at(self.held), _at(_WAVES), _DIRECTIONS, *_OPEN, _WALL, _at(after))
 
     def _land(self, current: Points, rows: slice, after: Points) -> None:
         given = (self._graph, rows.start, rows.stop, _at(current), _at(self.points), _at(self.normal), _at(self.sheet))

@@ -17,6 +17,8 @@ from pcdenoise.cloud.scan import Points
 _APART = {1: 0.52, 2: 0.39, 3: 0.31, 5: 0.23}
 """Share of candidates that remain when none may be among the so many nearest of another (measured)."""
 _MOST_MORE = 1.5
+"""Where there is little noise there are so many times the seeds at most: others could not be spread as evenly."""
+_LARGEST = 1 / 8
 _LANDSCAPE = 11.0
 """Neighbourhoods hold 11·√(points that show the surface) raw points: the balance of noise, which asks for all of them, and of
 curvature, which asks for few (measured on shapes that serve for nothing else)."""
@@ -40,6 +42,16 @@ def share_of_seeds(level: NoiseLevel, neighbours: int) -> float:
     share = neighbours / (_LANDSCAPE * level.scale_points**0.5)
     densest = max(_APART.values())
     return min(share, densest) if share < 1.5 * densest else 1.0
+
+
+def times_noisier(noise: NDArray[np.float64], level: NoiseLevel, neighbours: int) -> NDArray[np.float64]:
+    """(N,) how many times noisier than the whole cloud each point is, as far as `coarsen` should heed it.
+
+    noise (N,): what it is there. No place is to be seen by the network as a larger share of a small cloud than _LARGEST.
+    """
+    largest = _LARGEST * level.n_points * share_of_seeds(level, neighbours) / neighbours
+    times: NDArray[np.float64] = np.minimum(noise / level.std, max(1.0, largest))
+    return times
 
 
 def coarsen(

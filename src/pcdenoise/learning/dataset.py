@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from pcdenoise.cloud.neighbours import coordinate_hash, knn, spatial_order
 from pcdenoise.cloud.noise_level import by_place, estimate
-from pcdenoise.denoising.seeds import coarsen, share_of_seeds
+from pcdenoise.denoising.seeds import coarsen, share_of_seeds, times_noisier
 from pcdenoise.learning.ahead import CloudsAhead
 from pcdenoise.synthesis import noise
 
@@ -233,7 +233,7 @@ def _prepared(
     if share == 1:
         judged = inside(noisy)
         return made(noisy, None, None, judged & ~clutter, judged, clutter, noise_at_seeds=misread * around, noise_at_raw=None)
-    noisier = around / max(level.std, 1e-300)
+    noisier = times_noisier(around, level, neighbours)
     seeds = coarsen(noisy, share, seed=int(rng.integers(2**31)), threads=1, noisier=noisier)
     seed_judged = inside(seeds.points)
     if clutter.any():

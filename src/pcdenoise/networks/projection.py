@@ -120,7 +120,7 @@ def smallest_eigenvector(matrix: Tensor) -> tuple[Tensor, Tensor]:
 def point_features(graph: Edges, plane: Planes, noise: Tensor) -> Tensor:
     """(M, 4) what a point knows of its surroundings: thickness, narrowness, noise in its scale, noise explaining thickness.
 
-    noise (M,): standard deviation, in the unit of `graph.scale`.
+    noise (M,), or one for all: standard deviation, in the unit of `graph.scale`.
     """
     thin, middle, wide = (plane.shape / graph.scale).unbind(-1)
     level = noise / graph.scale[:, 0]
@@ -130,14 +130,14 @@ def point_features(graph: Edges, plane: Planes, noise: Tensor) -> Tensor:
 def edge_features(graph: Edges, own: Planes, theirs: Planes, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """(M, K, 8) invariants of each edge, and the signed heights a and b (M, K) that they are made of.
 
-    noise (M,): standard deviation. a: height of the neighbour over my plane; b: height of the neighbour's plane over me. All
-    features keep their value when the cloud is rotated or mirrored and when any normal changes its sign.
+    noise (M,), or one for all: standard deviation. a: height of the neighbour over my plane; b: height of the neighbour's plane
+    over me. All features keep their value when the cloud is rotated or mirrored and when any normal changes its sign.
     """
     normal = at(theirs.normal, graph.source)
     a = (graph.offset * own.normal[:, None]).sum(-1)
     b = (graph.offset * normal).sum(-1)
     cosine = (normal * own.normal[:, None]).sum(-1)
-    level = (noise[:, None] / graph.scale + 0.02).expand_as(a)
+    level = (noise.reshape(-1, 1) / graph.scale + 0.02).expand_as(a)
     high, deep = a.abs(), b.abs()
     features = torch.stack(
         [
