@@ -42,6 +42,13 @@ def cloud(name: str, n: int, std_spacings: float, seed: int = 0) -> Cloud:
     return Cloud(surface, clean, clean + std_spacings * spacing * rng.standard_normal((n, 3)), spacing)
 
 
+def varied(sample: Cloud, quietest: float, noisiest: float) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) the clean points with the sample's noise times (N,) a factor that grows with x, from the one to the other."""
+    x = sample.clean[:, 0]
+    times = quietest * (noisiest / quietest) ** ((x - x.min()) / np.ptp(x))
+    return sample.clean + times[:, None] * (sample.noisy - sample.clean), times
+
+
 def ball(n: int, rng: np.random.Generator) -> np.ndarray:
     """n points strewn evenly through the unit ball: a volume, no surface."""
     points = rng.standard_normal((n, 3))

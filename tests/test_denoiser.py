@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from known_clouds import UTM, Cloud, cloud, model, moves, rotation
+from known_clouds import UTM, Cloud, cloud, model, moves, rotation, varied
 from pcdenoise import io
 from pcdenoise.cloud.neighbours import coordinate_hash, knn
 from pcdenoise.cloud.noise_level import estimate
@@ -79,6 +79,17 @@ def test_errors_that_neighbours_share_are_removed_where_the_noise_is_told(shippe
     guessed, told = (denoise(scan.noisy, shipped, PLAIN.model_copy(update={"noise": noise})) for noise in (None, std))
     assert guessed.figures["noise"] < 0.5 * std == 0.5 * told.figures["noise"]
     assert scan.error(told.points) < 0.8 * scan.error(guessed.points)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_that_grows_along_a_scan_is_removed_better_than_by_one_number(
+    shipped: Model, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sample = cloud("cylinder", 12_000, 0.6, seed)
+    noisy, _ = varied(sample, 0.5, 4.0)
+    by_place = denoise(noisy, shipped, PLAIN).points
+    monkeypatch.setattr(network_pass, "by_place", lambda points, _identity, level, _threads: np.full(len(points), level.std))
+    assert sample.error(by_place) < 0.97 * sample.error(denoise(noisy, shipped, PLAIN).points)
 
 
 def test_telling_the_noise_that_would_have_been_read_is_as_good_where_all_places_have_it(shipped: Model, coarse: Cloud) -> None:

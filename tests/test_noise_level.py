@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from known_clouds import SURFACES, UTM, ball, cloud, rotation
-from pcdenoise.cloud.noise_level import N_PROBES, NoiseLevel, estimate
+from known_clouds import SURFACES, UTM, ball, cloud, rotation, varied
+from pcdenoise.cloud import noise_level
+from pcdenoise.cloud.neighbours import coordinate_hash, spatial_order
+from pcdenoise.cloud.noise_level import N_PROBES, NoiseLevel, by_place, estimate
 
 NO_SURFACE = {
     "ball": ball,
@@ -129,3 +131,72 @@ def test_one_point_far_away_does_not_hide_the_rest() -> None:
     found = estimate(np.concatenate([points, [[1e9, 0, 0]]]), threads=1)
     assert found.std == pytest.approx(estimate(points, threads=1).std, rel=0.1)
     assert found.is_surface
+
+
+# Noise by place
+
+
+def placed(points: np.ndarray, known_std: float | None = None) -> tuple[np.ndarray, NoiseLevel]:
+    """By place, in the order of the rows that are given."""
+    order = spatial_order(points)
+    ordered, level = points[order], estimate(points, threads=1, known_std=known_std)
+    noise = np.empty(len(points))
+    noise[order] = by_place(ordered, coordinate_hash(ordered, 0), level, threads=1)
+    return noise, level
+
+
+@pytest.mark.parametrize("name", ["plane", "sphere", "torus"])
+def test_noise_that_is_the_same_everywhere_is_the_same_at_every_place(name: str) -> None:
+    noise, level = placed(cloud(name, 8000, 1.0).noisy)
+    # Readings are means over 384 points, of a scatter of 4 %, and the factor within which they are not told apart is 1.33.
+    assert np.mean(np.abs(noise / level.std - 1) < 0.05) > 0.95
+
+
+@pytest.mark.parametrize("name", ["plane", "sphere", "cylinder"])
+def test_places_tell_how_noise_grows_along_a_scan(name: str) -> None:
+    sample = cloud(name, 20_000, 1.0)
+    noisy, times = varied(sample, 0.6, 2.4)
+    noise, level = placed(noisy)
+    true = times * sample.spacing
+    log_ratio = np.log(noise / true)
+    # Within 1.33 of the cloud's it counts as the cloud's, and what is beyond counts by so much less: ln 1.33 = 0.29, and 4 %.
+    assert np.sqrt(np.mean(log_ratio**2)) < 0.45
+    assert np.sqrt(np.mean(log_ratio**2)) < 0.75 * np.sqrt(np.mean(np.log(level.std / true) ** 2))
+    assert np.corrcoef(np.log(noise), np.log(true))[0, 1] > 0.8
+
+
+def test_places_are_within_bounds_and_take_what_is_known_as_it_is(rng: np.random.Generator) -> None:
+    noisy, _ = varied(cloud("plane", 6000, 1.0), 0.4, 4.0)
+    noise, level = placed(noisy)
+    assert np.all((noise >= level.std / noise_level.MOST_TIMES) & (noise <= level.std * noise_level.MOST_TIMES))
+    assert noise.max() > 1.5 * level.std
+    known, level = placed(noisy, known_std=0.03)
+    assert level.is_known
+    np.testing.assert_array_equal(known, 0.03)
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 3)), np.zeros((1, 3)), np.arange(45.0).reshape(15, 3) % 7])
+def test_few_points_have_the_noise_of_the_cloud(points: np.ndarray) -> None:
+    level = NoiseLevel(0.1, 1.0, 16.0, False, n_points=len(points))
+    np.testing.assert_array_equal(by_place(points, coordinate_hash(points, 0), level, threads=1), np.full(len(points), 0.1))
+
+
+def test_a_part_of_a_cloud_has_the_noise_by_place_that_the_whole_has() -> None:
+    noisy, _ = varied(cloud("plane", 20_000, 0.6), 0.5, 3.0)
+    noisy = noisy[spatial_order(noisy)]
+    identity, level = coordinate_hash(noisy, 0), estimate(noisy, threads=1)
+    whole = by_place(noisy, identity, level, threads=1)
+    part = np.abs(noisy[:, 0]) < 0.7
+    inner = np.abs(noisy[:, 0]) < 0.3  # 384 points reach about 11 spacings, the neighbourhoods of their places 5 more
+    found = np.empty(len(noisy))
+    found[part] = by_place(noisy[part], identity[part], level, threads=1)
+    np.testing.assert_allclose(found[inner], whole[inner], rtol=1e-12)
+
+
+def test_noise_by_place_follows_turns_units_and_the_order_of_rows(rng: np.random.Generator) -> None:
+    noisy, _ = varied(cloud("torus", 900, 1.0), 0.5, 3.0)  # few enough for every point to be a place
+    noise, _ = placed(noisy)
+    order = rng.permutation(len(noisy))
+    np.testing.assert_allclose(placed(noisy[order])[0], noise[order], rtol=1e-9)
+    np.testing.assert_allclose(placed(noisy @ rotation(rng).T)[0], noise, rtol=1e-6)
+    np.testing.assert_allclose(placed(noisy * 1e3)[0], noise * 1e3, rtol=1e-6)

@@ -46,7 +46,7 @@ def test_on_a_curved_surface_points_slide_and_land_on_it_again(name: str, curvat
     # The 12 neighbours of a landing point reach ρ = spacing √(12 / π) and lie up to κρ²/2 under its tangent plane; the half sum
     # of heights and depths cancels that where they surround the point, and no neighbourhood may err by more than its depth.
     left, reach = np.abs(clean.surface.signed_distance(relaxed))[inner], knn(clean.clean, 13, threads=1)[0][:, -1].max()
-    assert rms(left) < 0.1 * curvature * clean.spacing**2 * 12 / np.pi / 2
+    assert rms(left) < 0.12 * curvature * clean.spacing**2 * 12 / np.pi / 2
     assert left.max() < curvature * reach**2 / 2
 
 

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from known_clouds import SURFACES, ball, cloud
 from pcdenoise.cloud.neighbours import spatial_order
 from pcdenoise.cloud.noise_level import NoiseLevel
-from pcdenoise.denoising.seeds import coarsen, share_of_seeds
+from pcdenoise.denoising.seeds import coarsen, share_of_seeds, times_noisier
 
 N = 6000
 
@@ -102,3 +102,30 @@ def test_the_share_of_seeds_falls_with_the_scale_of_the_noise_and_is_one_for_lit
     assert max(share for share in shares if share < 1) <= 0.52  # no sparser set of candidates leaves more
     # Twenty-four seeds then stand for 11 √(points that show the surface) raw points.
     assert shares[-1] == pytest.approx(24 / (11 * np.sqrt(2000)))
+
+
+def test_seeds_are_fewer_where_it_is_noisier_and_more_where_it_is_quieter(rng: np.random.Generator) -> None:
+    square = ordered(np.column_stack([rng.random((20_000, 2)), np.zeros(20_000)]))
+    left = square[:, 0] < 0.5
+    even = coarsen(square, 0.1, threads=1).points[:, 0]
+    for times, right, quiet in ((2.0, 0.5, 1.0), (0.5, 1.5, 1.0)):  # half the noise has half more seeds, not twice as many
+        seeds = coarsen(square, 0.1, threads=1, noisier=np.where(left, 1.0, times)).points[:, 0]
+        # Candidates by the thousand are drawn, and seeds thin them out: 5 % of scatter, and another layout's share of remainders.
+        assert np.sum(seeds >= 0.5) / np.sum(even >= 0.5) == pytest.approx(right, rel=0.15)
+        assert np.sum(seeds < 0.5) / np.sum(even < 0.5) == pytest.approx(quiet, rel=0.15)
+
+
+def test_no_place_is_seen_as_a_large_share_of_a_small_cloud() -> None:
+    noise = np.array([0.5, 1.0, 3.0])
+    large = NoiseLevel(1.0, 1.0, 100.0, True, n_points=10**6)
+    np.testing.assert_array_equal(times_noisier(noise, large, 32), noise)
+    small = NoiseLevel(1.0, 1.0, 100.0, True, n_points=1000)  # 110 points are looked at, an eighth are 125
+    np.testing.assert_allclose(times_noisier(noise, small, 32), [0.5, 1.0, 125 / 110])
+    tiny = NoiseLevel(1.0, 1.0, 100.0, True, n_points=300)
+    np.testing.assert_array_equal(times_noisier(noise, tiny, 32), [0.5, 1.0, 1.0])
+
+
+def test_means_are_over_the_points_of_each_cell(rng: np.random.Generator) -> None:
+    points = ordered(cloud("torus", 3000, 0.5).noisy)
+    seeds = coarsen(points, 0.1, threads=1)
+    np.testing.assert_allclose(np.stack([seeds.means(axis) for axis in points.T], axis=1), seeds.points, atol=1e-12)

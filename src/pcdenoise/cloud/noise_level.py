@@ -38,11 +38,13 @@ _CLEARER_SHARE = 0.3  # this share of all places must show it: edges and thin pa
 _SEEN = ([3.0, 3.7, 4.1, 4.7, 5.2, 6.1, 8.0], [0.72, 0.82, 0.86, 0.9, 0.92, 0.94, 0.95])
 _POINTS_PER_PLACE, _POINTS_AROUND, _PLACES_SEED = 32, 384, 5
 """Noise by place is read at one point in so many, at N_PROBES at least, and is a mean over the places of so many points."""
+_UNCERTAIN = 4 / 3
+"""A reading is told from the cloud's by what it goes beyond this factor: curvature and thin parts alone read as much."""
 _PLACES_FROM, _PLACES_IN_FULL = 1.0, 4.0
 """Points within the scale of the noise at which places begin to count, and count in full: where there are few, the smallest
 neighbourhood is much larger than that scale, and what it leaves may be curvature."""
 _ENOUGH = 48  # points tell what a neighbourhood of any size leaves: of larger ones a share is drawn
-MOST_TIMES = 2.5
+MOST_TIMES = 3.0
 """Noise by place is within so many times that of the whole cloud."""
 _SCALE_STDS = 4.5  # the radius of the neighbourhood of `scale_points`
 
@@ -156,8 +158,10 @@ def by_place(points: Points, identity: Identity, level: NoiseLevel, threads: int
     if not len(places):
         return everywhere
     times = np.clip(np.where(np.isnan(std), 1.0, std / level.std), 1 / MOST_TIMES, MOST_TIMES)
+    logarithm = np.log(_spread(places, times, points, level, threads))
     share = np.clip((level.scale_points - _PLACES_FROM) / (_PLACES_IN_FULL - _PLACES_FROM), 0, 1)
-    noise: NDArray[np.float64] = level.std * _spread(places, times, points, level, threads) ** share
+    beyond = share * np.sign(logarithm) * np.maximum(np.abs(logarithm) - np.log(_UNCERTAIN), 0)
+    noise: NDArray[np.float64] = level.std * np.exp(beyond)
     return noise
 
 
@@ -167,17 +171,17 @@ def _readings(points: Points, drawn: NDArray[np.uint64], level: NoiseLevel, thre
     Neighbourhoods grow from the cloud's own scale until they show a surface, and hold what a quadric leaves in them; NaN where
     none does. Of large ones a share of the points is looked at.
     """
-    looked_at = min(1.0, _ENOUGH / level.scale_points)
-    cloud = points[drawn <= _threshold(looked_at)]
-    places = points[drawn <= _threshold(looked_at * _share_of_places(level, looked_at))]
+    looked_at = _share_looked_at(level)
+    places = points[drawn <= _threshold(looked_at * _share_of_places(level))]
     std = np.full(len(places), np.nan)
-    if len(cloud) < _LADDER[0] or not len(places):
-        return places, std
-    search = NeighbourSearch(cloud, threads)
-    first = int(np.clip(level.scale_points, _LADDER[1], _ENOUGH))
-    most = max(first, round(looked_at * level.n_points / 4))
-    for k in (min(times * first, most, len(cloud)) for times in (1, 2, 4)):
-        for block in np.array_split(np.flatnonzero(np.isnan(std)), max(1, len(places) * k // _PROBED)):
+    for times in (1, 2, 4, 8):
+        looked_at, left = _share_looked_at(level, times), np.flatnonzero(np.isnan(std))
+        k = max(_LADDER[1], round(looked_at * times * level.scale_points))
+        cloud = points[drawn <= _threshold(looked_at)]
+        if not len(left) or k > len(cloud) or (times > 1 and k > looked_at * level.n_points / 4):
+            break
+        search = NeighbourSearch(cloud, threads)
+        for block in np.array_split(left, max(1, len(left) * k // _PROBED)):
             distances, indices = search.knn(places[block], k)
             radius = np.maximum(distances[:, -1], 1e-300)
             aspect = 1 / np.maximum(_quadric_residual(cloud[indices], places[block], radius), 1e-6)
@@ -191,9 +195,14 @@ def _threshold(share: float) -> np.uint64:
     return np.uint64(share * float(2**64 - 2**11))
 
 
-def _share_of_places(level: NoiseLevel, looked_at: float = 1.0) -> float:
+def _share_looked_at(level: NoiseLevel, times: float = 1) -> float:
+    """Points of which neighbourhoods so many times the scale are made, of all: fewer where each has many, all of a small cloud."""
+    return min(1.0, max(_ENOUGH / (times * level.scale_points), 4 * N_PROBES / max(1, level.n_points)))
+
+
+def _share_of_places(level: NoiseLevel) -> float:
     """Places per point that is looked at."""
-    return min(1.0, max(1 / _POINTS_PER_PLACE, N_PROBES / max(1.0, looked_at * level.n_points)))
+    return min(1.0, max(1 / _POINTS_PER_PLACE, N_PROBES / max(1.0, _share_looked_at(level) * level.n_points)))
 
 
 def _spread(places: Points, std: NDArray[np.float64], at: Points, level: NoiseLevel, threads: int) -> NDArray[np.float64]:
@@ -211,8 +220,7 @@ def _spread(places: Points, std: NDArray[np.float64], at: Points, level: NoiseLe
         averaged = (known * np.nan_to_num(values[index])).sum(axis=1) / np.maximum(share, 1e-300)
         return np.where(share >= 0.5 * weight.sum(axis=1), averaged, np.nan)
 
-    looked_at = min(1.0, _ENOUGH / level.scale_points)
-    around = round(_POINTS_AROUND * _share_of_places(level, looked_at))
+    around = round(_POINTS_AROUND * _share_of_places(level))
     return np.exp(mean(at, 3, mean(places, around, np.log(np.maximum(std, 1e-300)))))
 
 

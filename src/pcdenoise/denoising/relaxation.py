@@ -29,9 +29,9 @@ _WAVES = np.stack([wave(2 * np.pi / _DIRECTIONS * np.arange(_DIRECTIONS)) for wa
 _OPEN, _WALL = (1.0, 1.4), 0.5
 """Local spacings: a cell that reaches further than the first is taken for one at an open border, in full from the second on, and
 ends as far off as it would in an even cloud."""
-_HELD = 0.03
+_HELD = 0.02
 """Times (spacing / noise)²: of where a point was measured and what an even cloud asks for each has its weight."""
-_REACH_STDS = 1.0
+_REACH_STDS = 1.5
 """How far a point may slide in all, in standard deviations of the noise: isotropic noise has displaced it by so much along
 the surface too, so a clean cloud stays as it is."""
 _SHEET = (0.25, 0.4)
