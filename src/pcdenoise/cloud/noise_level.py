@@ -196,7 +196,7 @@ def _threshold(share: float) -> np.uint64:
 
 
 def _share_looked_at(level: NoiseLevel, times: float = 1) -> float:
-    """Points of which neighbourhoods so many times the scale are made, of all: fewer where each has many, all of a small cloud."""
+    """Of all points, those of which neighbourhoods of so many times the scale are made: not all where each would have many."""
     return min(1.0, max(_ENOUGH / (times * level.scale_points), 4 * N_PROBES / max(1, level.n_points)))
 
 
