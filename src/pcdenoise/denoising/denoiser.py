@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pcdenoise.cloud import drift
 from pcdenoise.cloud.neighbours import Identity, coordinate_hash, distinct_by, drawn_by, spatial_order
-from pcdenoise.cloud.noise_level import NoiseLevel, estimate_at, probes
+from pcdenoise.cloud.noise_level import NoiseLevel, by_place, estimate_at, probes
 from pcdenoise.cloud.scan import Mask, Points, check_extent, within
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import classical, network_pass, outliers, uncertainty
@@ -111,8 +111,11 @@ def denoise(
         figures["outliers"] = int(found.sum())
     std = None
     if config.uncertainty:
-        order = spatial_order(cloud.reached)
-        off = uncertainty.estimate(cloud.reached[order], cloud.start, cloud.reached, moved, cloud.level, cloud.threads)
+        off = np.full(len(moved), np.nan)
+        if cloud.level.is_surface:
+            noise = by_place(cloud.start, cloud.identity, cloud.level, cloud.threads)
+            cleaned = cloud.reached[spatial_order(cloud.reached)]
+            off = uncertainty.estimate(cleaned, cloud.start, cloud.reached, moved, noise, cloud.threads)
         std = cloud.to_rows(off, np.nan)
     placed = [Step(cloud.placed(step.points), step.figures) for step in steps]
     return Result(placed[-1].points if placed else points.copy(), found, unmoved, figures, placed, std)

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from pcdenoise.cloud import drift
 from pcdenoise.cloud.neighbours import Distances, Identity, NeighbourSearch, coordinate_hash, distinct_by, drawn_by, spatial_order
-from pcdenoise.cloud.noise_level import N_PROBES, NoiseLevel, estimate_from
+from pcdenoise.cloud.noise_level import N_PROBES, NoiseLevel, by_place, estimate_from
 from pcdenoise.cloud.scan import Mask, Points, check_extent
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import classical, denoiser, outliers, risk, uncertainty
@@ -377,13 +377,18 @@ class Tiles:
     def find_uncertainty(self, cell: int, number: int, level: NoiseLevel) -> None:
         """How far the points of one cell may still be off after that pass; nothing if that is done already."""
         path = self.folder / "std" / f"{cell}.f64"
-        if not path.is_file():
-            own, tile = self._tile(cell, number)
-            start = self._part(cell, 0).points
+        if path.is_file():
+            return
+        own, tile = self._tile(cell, number)
+        std = np.full(len(own.points), np.nan)
+        if level.is_surface:
+            measured, around = self._tile(cell, 0)
+            order, noise = spatial_order(around.points), np.empty(len(around.points))
+            noise[order] = by_place(around.points[order], around.identity[order], level, self.threads)
+            start, cleaned = measured.points, tile.points[spatial_order(tile.points)]
             final = start if number == 0 else denoiser.limited(start, own.points, self.config)
-            order = spatial_order(tile.points)
-            std = uncertainty.estimate(tile.points[order], start, own.points, final, level, self.threads)
-            _write(path, std.tobytes())
+            std = uncertainty.estimate(cleaned, start, own.points, final, noise[: len(start)], self.threads)
+        _write(path, std.tobytes())
 
     def _tile(self, cell: int, number: int) -> tuple[_Part, _Part]:
         """A cell's own points after a pass, and these followed by its rim."""

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdenoise.cloud.neighbours import NeighbourSearch
-from pcdenoise.cloud.noise_level import NoiseLevel
 from pcdenoise.cloud.scan import Points
 
 FACTOR, EXPONENT = 0.455, 0.304
@@ -26,21 +25,19 @@ _AT_ONCE = 1 << 14
 
 
 def estimate(
-    cloud: Points, start: Points, reached: Points, final: Points, level: NoiseLevel, threads: int = -1
+    cloud: Points, start: Points, reached: Points, final: Points, noise: NDArray[np.float64], threads: int = -1
 ) -> NDArray[np.float64]:
-    """(N,) standard deviation along the normal of what points are still off, in their unit; NaN where the cloud has no surface.
+    """(N,) standard deviation along the normal of what points are still off, in their unit; for clouds that show a surface.
 
-    cloud (M, 3)    all cleaned points around, these among them, in spatial order; at least 16 for a surface.
+    cloud (M, 3)    all cleaned points around, these among them, in spatial order.
     start, reached, final (N, 3)   the points before all passes, where these led, and what strength and limit left of the way:
                     who goes a part of it keeps the rest of the noise, and who stays all of it.
-    level           the noise before all passes.
+    noise (N,)      standard deviation of the noise before all passes, at each of these points.
     """
-    if not level.is_surface or len(start) == 0:
-        return np.full(len(start), np.nan)
-    off = FACTOR * level.std ** (1 - EXPONENT) * thickness(cloud, reached, threads) ** EXPONENT
+    off = FACTOR * noise ** (1 - EXPONENT) * thickness(cloud, reached, threads) ** EXPONENT
     whole, gone = (np.linalg.norm(places - start, axis=1) for places in (reached, final))
     share = np.divide(gone, whole, out=np.zeros(len(start)), where=whole > 0)
-    std: NDArray[np.float64] = np.hypot(share * off, (1 - share) * level.std)
+    std: NDArray[np.float64] = np.hypot(share * off, (1 - share) * noise)
     return std
 
 
