@@ -58,7 +58,8 @@ def projection(
         moved, shape = fused.descend(*given, threads=threads, on_block=on_block)
     else:
         moved, shape = _in_torch(model, seeds, count, raw, (seed_noise, noise), threads, on_block)
-    return points + trust(shape, seed_noise)[cell, None] * (moved - points), noise
+    explained = np.sqrt(seed_noise * level.std)  # half-way to the cloud's own: where foliage grows, places read much noise too
+    return points + trust(shape, explained)[cell, None] * (moved - points), noise
 
 
 def trust(shape: NDArray[np.float32], noise: fused.Noise) -> NDArray[np.float64]:
