@@ -70,9 +70,13 @@ def _bars(title: str, groups: Sequence[str], names: Sequence[str], numbers: np.n
 
 
 def page(folder: Path, images: str) -> str:
-    """docs/paper.md from the JSON files in a folder; `images` is where its pictures are, seen from the page."""
+    """docs/paper.md from the JSON files in a folder; `images` is where its pictures are, seen from the page.
+
+    What the folder's about.md says, if it is there, stands before the results.
+    """
     found = {name: json.loads(path.read_text()) for name in (*TABLES, *FIGURES) if (path := folder / f"{name}.json").exists()}
-    parts = [_OPENING, _orderings(found), _stops(found), "## Tables\n"]
+    about = folder / "about.md"
+    parts = [_OPENING, about.read_text() if about.exists() else "", _orderings(found), _stops(found), "## Tables\n"]
     for name, table in TABLES.items():
         parts += [f"### {table.title}\n", _run_of(name, found), _table(found[name], images) if name in found else ""]
     parts.append("## Figures\n")
