@@ -169,7 +169,7 @@ def _readings(points: Points, drawn: NDArray[np.uint64], level: NoiseLevel, thre
     """(P, 3) places, some of (N, 3) points in spatial order as drawn, and the noise std (P,) that shows there.
 
     Neighbourhoods grow from the cloud's own scale until they show a surface, and hold what a quadric leaves in them; NaN where
-    none does. Of large ones a share of the points is looked at.
+    none does, or only so large a share of the cloud that it may be a thin part. Of large ones a share of the points is looked at.
     """
     looked_at = _share_looked_at(level)
     places = points[drawn <= _threshold(looked_at * _share_of_places(level))]
@@ -178,7 +178,7 @@ def _readings(points: Points, drawn: NDArray[np.uint64], level: NoiseLevel, thre
         looked_at, left = _share_looked_at(level, times), np.flatnonzero(np.isnan(std))
         k = max(_LADDER[1], round(looked_at * times * level.scale_points))
         cloud = points[drawn <= _threshold(looked_at)]
-        if not len(left) or k > len(cloud) or (times > 1 and k > looked_at * level.n_points / 4):
+        if not len(left) or k > len(cloud) or (times > 1 and k > _SMALL_SHARE * looked_at * level.n_points):
             break
         search = NeighbourSearch(cloud, threads)
         for block in np.array_split(left, max(1, len(left) * k // _PROBED)):
