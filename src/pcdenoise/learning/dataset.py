@@ -31,13 +31,13 @@ N_RAW = 48_000
 N_LANDING = 4_000
 """Most seeds, raw points and landing points of one training cloud; larger ones are cut to a ball."""
 _LAWS = {
-    "gaussian": 0.5,
-    "rays": 0.11,
+    "gaussian": 0.64,
+    "rays": 0.08,
     "heavy-tailed": 0.1,
-    "laplace": 0.07,
-    "anisotropic": 0.08,
-    "beam-bias": 0.08,
-    "quantised": 0.06,
+    "laplace": 0.04,
+    "anisotropic": 0.06,
+    "beam-bias": 0.04,
+    "quantised": 0.04,
 }
 """How often each law of noise is met."""
 
