@@ -45,10 +45,11 @@ from pcdenoise.whole_files import replaced
 BASE_BYTES, POINT_BYTES = 400 << 20, 1100
 """Memory of the program itself, and of each point of the part that is being cleaned: measured where torch
 runs the network, with a tenth to spare; compiled code takes three quarters of it."""
-_CORE_SHARE = 0.55  # of a tile's points are the cell's own, the others its rim
-_RIM_RADII = 5.0
+_CORE_SHARE = 0.47  # of a tile's points are the cell's own, the others its rim
+_RIM_RADII = 6.5
 """Width of the rim in radii of the network's neighbourhoods. A pass reaches eight radii at most, but a neighbour's weight is zero
-at one radius, so that what lies beyond five does not reach a thousandth of the noise (a test measures it)."""
+at one radius, so that what lies beyond five does not reach a thousandth of the noise (a test measures it); and where a place is
+noisier than the cloud, neighbourhoods are wider, by up to a half."""
 _RIM_NEIGHBOURS = 24
 _LARGER_CELLS = 1.5  # than asked for are still gone on with: how much memory is free changes from run to run
 _SAMPLED = 256
