@@ -62,8 +62,8 @@ def test_coordinate_systems_are_read_from_text_and_geotiff(records: dict[int, by
 
 @pytest.mark.parametrize("name", ["plane", "sphere", "torus"])
 def test_the_map_follows_a_noise_that_grows_along_the_scan(name: str) -> None:
-    """A neighbourhood of at least 58 degrees of freedom (64 points) has a scatter of 9 %, three of them of 5 %, and holds noise
-    that varies: 15 % for half of the points and a high correlation are what may be asked."""
+    """The places of 384 points are averaged, to a scatter of about 4 %, and hold noise that varies: 15 % for half of the points
+    and a high correlation are what may be asked."""
     sample = cloud(name, 8000, 1.0)
     along = sample.clean[:, 0] - sample.clean[:, 0].min()
     share = 0.3 + along / along.max()

@@ -86,7 +86,7 @@ def test_a_lattice_is_at_rest() -> None:
 
 
 def test_points_on_a_wire_do_not_fan_out_to_a_ribbon(rng: np.random.Generator) -> None:
-    # Repulsion along a line buckles it: without a second dimension to spread in there must be no push at all.
+    # Cells of a line have no width: without a second dimension nothing may spread into it.
     t = np.sort(rng.random(400)) * 6
     wire = np.column_stack([t, np.sin(t), 0.3 * np.cos(2 * t)])
     np.testing.assert_allclose(relax(wire, 0.05, STEPS, threads=1), wire, atol=1e-3)
@@ -155,3 +155,18 @@ def test_a_low_pass_leaves_lonely_points_and_empty_clouds_alone(rng: np.random.G
     points, moves = np.arange(15.0).reshape(5, 3), rng.standard_normal((5, 3))
     np.testing.assert_array_equal(without_low_frequencies(points, moves, 0.1, rng), moves)
     assert len(without_low_frequencies(points[:0], moves[:0], 0.1, rng)) == 0
+
+
+def test_points_that_a_pass_has_led_to_one_place_stay_numbers(rng: np.random.Generator) -> None:
+    points = np.concatenate([np.full((14, 3), 0.5), np.column_stack([rng.random((300, 2)), np.full(300, 0.5)])])
+    relaxed = relax(points, 0.05, STEPS, threads=1)
+    assert np.isfinite(relaxed).all()
+    assert moves(points, relaxed).max() <= 0.05 * relaxation._REACH_STDS * (1 + 1e-9)
+
+
+def test_each_point_slides_by_the_noise_of_its_place() -> None:
+    sample = cloud("plane", 1500, 0.0)
+    std = np.where(sample.clean[:, 0] > 0, 0.5 * sample.spacing, 0.0)
+    slide = moves(sample.clean, relax(sample.clean, std, STEPS, threads=1))
+    assert np.median(slide[std > 0]) > 0.1 * sample.spacing
+    assert slide[std == 0].max() <= 1e-12

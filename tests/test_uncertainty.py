@@ -51,8 +51,8 @@ def test_where_there_was_more_noise_more_uncertainty_is_left() -> None:
     distance = np.abs(sample.surface.signed_distance(result.points))
     quiet, loud = times < 0.9, times > 1.4
     assert result.std[loud].mean() > 1.5 * result.std[quiet].mean()
-    for place in (quiet, loud):  # by three times 0.053, as above, and as much again for what places are not told apart by
-        assert (distance[place] < result.std[place]).mean() == pytest.approx(0.683, abs=6 * 0.053)
+    for place in (quiet, loud):  # three times 0.053, as above, and two more for what places are not told apart by (0.43 to 0.77)
+        assert (distance[place] < result.std[place]).mean() == pytest.approx(0.683, abs=5 * 0.053)
 
 
 def test_where_there_is_no_surface_nothing_is_claimed(rng: np.random.Generator) -> None:

@@ -37,15 +37,16 @@ once a neighbourhood is half of them."""
 _CLEARER_SHARE = 0.3  # this share of all places must show it: edges and thin parts stay thick at any scale
 _SEEN = ([3.0, 3.7, 4.1, 4.7, 5.2, 6.1, 8.0], [0.72, 0.82, 0.86, 0.9, 0.92, 0.94, 0.95])
 _POINTS_PER_PLACE, _POINTS_AROUND, _PLACES_SEED = 32, 384, 5
-"""Noise by place is read at one point in so many, at N_PROBES at least, and is a mean over the places of so many points."""
-_UNCERTAIN = 4 / 3
+"""Noise by place is read at one in so many of the points that are looked at, at N_PROBES at least, and is a mean over the places
+of so many of them."""
+UNCERTAIN = 4 / 3
 """A reading is told from the cloud's by what it goes beyond this factor: curvature and thin parts alone read as much."""
 _PLACES_FROM, _PLACES_IN_FULL = 1.0, 4.0
 """Points within the scale of the noise at which places begin to count, and count in full: where there are few, the smallest
 neighbourhood is much larger than that scale, and what it leaves may be curvature."""
 _ENOUGH = 48  # points tell what a neighbourhood of any size leaves: of larger ones a share is drawn
 MOST_TIMES = 3.0
-"""Noise by place is within so many times that of the whole cloud."""
+"""Readings count up to so many times the cloud's noise, so that noise by place is within MOST_TIMES / UNCERTAIN of it."""
 _SCALE_STDS = 4.5  # the radius of the neighbourhood of `scale_points`
 
 
@@ -146,21 +147,21 @@ def around(points: Points, level: NoiseLevel, at: Points | None = None, seed: in
 
 
 def by_place(points: Points, identity: Identity, level: NoiseLevel, threads: int = -1) -> NDArray[np.float64]:
-    """(N,) noise std at (N, 3) distinct points in spatial order, as a pass takes it: never NaN, MOST_TIMES the level's at most.
+    """(N,) noise std at (N, 3) distinct points in spatial order, as a pass takes it: never NaN, within bounds of the level's.
 
     Noise that is known, and that of places without a surface, is the level's. Places are drawn by identity (N,), and what is read
     there and spread from there lies near, so that a part of a cloud gives what the whole does.
     """
     everywhere = np.full(len(points), level.std)
-    if level.is_known or level.std <= 0:
+    share = float(np.clip((level.scale_points - _PLACES_FROM) / (_PLACES_IN_FULL - _PLACES_FROM), 0, 1))
+    if level.is_known or level.std <= 0 or share == 0:
         return everywhere
     places, std = _readings(points, drawn_by(identity, _PLACES_SEED), level, threads)
     if not len(places):
         return everywhere
     times = np.clip(np.where(np.isnan(std), 1.0, std / level.std), 1 / MOST_TIMES, MOST_TIMES)
     logarithm = np.log(_spread(places, times, points, level, threads))
-    share = np.clip((level.scale_points - _PLACES_FROM) / (_PLACES_IN_FULL - _PLACES_FROM), 0, 1)
-    beyond = share * np.sign(logarithm) * np.maximum(np.abs(logarithm) - np.log(_UNCERTAIN), 0)
+    beyond = share * np.sign(logarithm) * np.maximum(np.abs(logarithm) - np.log(UNCERTAIN), 0)
     noise: NDArray[np.float64] = level.std * np.exp(beyond)
     return noise
 

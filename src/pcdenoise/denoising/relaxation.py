@@ -29,8 +29,9 @@ _WAVES = np.stack([wave(2 * np.pi / _DIRECTIONS * np.arange(_DIRECTIONS)) for wa
 _OPEN, _WALL = (1.0, 1.4), 0.5
 """Local spacings: a cell that reaches further than the first is taken for one at an open border, in full from the second on, and
 ends as far off as it would in an even cloud."""
+_NO_SPACING = 1e-90  # where a pass has led points to one place; its square and cube are still numbers
 _HELD = 0.02
-"""Times (spacing / noise)²: of where a point was measured and what an even cloud asks for each has its weight."""
+"""Times (spacing / noise)²: of where the pass left a point and what an even cloud asks for each has its weight."""
 _REACH_STDS = 1.5
 """How far a point may slide in all, in standard deviations of the noise: isotropic noise has displaced it by so much along
 the surface too, so a clean cloud stays as it is."""
@@ -45,9 +46,10 @@ _LOW_PASS_POINTS = 256  # within its radius: more are thinned
 def relax(points: Points, noise_std: float | NDArray[np.float64], steps: int, threads: int = -1) -> Points:
     """Evens the spacing of (N, 3) finite, distinct points on a surface; row i stays row i, N < 4 comes back as it was.
 
-    noise_std: of the noise that brought them here, one for all or (N,) at each. Steps of Lloyd's algorithm, held back: each
-    point goes to the centre of its cell in the tangent plane, as far as it may have been displaced by noise; at the end all land
-    on the surface again. Where there is no sheet (wires, volumes, corners) points stay, or spreading them would change the shape.
+    noise_std: standard deviation of the noise, in the points' unit, one for all or (N,) at each. Steps of Lloyd's algorithm,
+    held back: each point goes to the centre of its cell in the tangent plane, as far as it may have been displaced by noise; at
+    the end all land on the surface again. Where there is no sheet (wires, volumes, corners) points stay, or spreading them would
+    change the shape.
     Neighbours are found once: those that bound a cell are among the twelve nearest before and after.
     """
     if len(points) <= 3 or steps == 0 or not np.any(noise_std):
@@ -55,7 +57,7 @@ def relax(points: Points, noise_std: float | NDArray[np.float64], steps: int, th
     k = min(_NEIGHBOURS, len(points) - 1)
     distances, found = NeighbourSearch(points, threads).knn(points, k + 1)
     start = np.ascontiguousarray(points, np.float64)
-    spacing = distances[:, k] * np.sqrt(np.pi / k)
+    spacing = np.maximum(distances[:, k] * np.sqrt(np.pi / k), _NO_SPACING)
     held = _HELD * (spacing / np.maximum(noise_std, 1e-9 * spacing)) ** 2
     sheet = (_Compiled if IS_BUILT else _Sheet)(start, found.astype(np.int32), spacing, held, threads)
     del distances, found
@@ -105,7 +107,7 @@ class _Sheet:
         """(N, 3) points one step further: on the way to the centre of their cell in the tangent plane, and held by their start.
 
         Along each of some directions the cell ends halfway to the neighbour that is met first, further where normals disagree.
-        Where none is near, at an open border, it ends where it would in an even cloud, so that borders stay.
+        Where none is near, at an open border, it ends where it would in an even cloud, so that borders creep less.
         """
         after = np.empty_like(current)
         each_block(lambda rows: self._even(current, rows, after), len(current), self.threads, _BLOCK)
@@ -145,7 +147,7 @@ class _Sheet:
         radius = np.minimum(1 / ends, _OPEN[1] * spacing)
         is_open = np.maximum((radius / spacing - _OPEN[0]) / (_OPEN[1] - _OPEN[0]), 0)
         radius += is_open * (_WALL * spacing - radius)
-        third, area = 2 / 3 * radius**3, (radius**2).sum(axis=1)
+        third, area = 2 / 3 * radius**3, np.maximum((radius**2).sum(axis=1), 1e-300)
         to_centre = sum(
             ((third * wave).sum(axis=1) / area)[:, None] * axis for wave, axis in zip(_WAVES, (first, second), strict=True)
         )

@@ -66,7 +66,8 @@ class Surface:
 class TrainingCloud:
     """One noisy cloud, ready for the network.
 
-    seeds (M, 3), count (M,); raw (F, 3): points that land on the seeds. Where every point is its own seed, both are None.
+    seeds (M, 3), count (M,); raw (F, 3): points that land on the seeds. Where every point is its own seed, they and
+    noise_at_raw are None.
     seed_judged (M,): seeds of the surface, far enough from the cut. judged, clutter (F,): final points far enough from the cut,
     and those that belong to no surface and should stay. noise: estimated standard deviation, noise_at_seeds (M,) and noise_at_raw
     (F,) what it is there; scale: what errors are divided by.

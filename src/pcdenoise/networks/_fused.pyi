@@ -2,7 +2,7 @@
 
 from typing import TypeAlias
 
-Surroundings: TypeAlias = tuple[int, int, int, int, int, float]
+Surroundings: TypeAlias = tuple[int, int, int, int, int, int]
 """points, sources, index, count, neighbours of a point, noise."""
 
 def look(around: Surroundings, start: int, stop: int, embedding: int, normals: int, shapes: int, features: int, /) -> None: ...
