@@ -46,7 +46,7 @@ def test_on_a_curved_surface_points_slide_and_land_on_it_again(name: str, curvat
     # The 12 neighbours of a landing point reach ρ = spacing √(12 / π) and lie up to κρ²/2 under its tangent plane; the half sum
     # of heights and depths cancels that where they surround the point, and no neighbourhood may err by more than its depth.
     left, reach = np.abs(clean.surface.signed_distance(relaxed))[inner], knn(clean.clean, 13, threads=1)[0][:, -1].max()
-    assert rms(left) < 0.12 * curvature * clean.spacing**2 * 12 / np.pi / 2
+    assert rms(left) < 0.11 * curvature * clean.spacing**2 * 12 / np.pi / 2
     assert left.max() < curvature * reach**2 / 2
 
 
@@ -54,10 +54,12 @@ def test_on_a_curved_surface_points_slide_and_land_on_it_again(name: str, curvat
 def test_no_point_goes_further_than_the_noise_can_have_displaced_it(name: str) -> None:
     clean, reach = cloud(name, 2000, 0.0), relaxation._REACH_STDS
     assert reach <= 2
-    for std in (0.2 * clean.spacing, 0.5 * clean.spacing):
+    for std_spacings in (0.01, 0.2, 0.5):
+        std = std_spacings * clean.spacing
         slide = moves(clean.clean, relax(clean.clean, std, 30, threads=1))
         assert slide.max() <= reach * std * (1 + 1e-9)
-        assert slide.max() > 0.95 * reach * std  # the bound is met, or this would test nothing
+        # The bound is met, or this would test nothing; by little noise a point is held before it comes so far.
+        assert std_spacings < 0.1 or slide.max() > 0.95 * reach * std
 
 
 def test_without_noise_without_steps_and_with_few_points_nothing_moves(rng: np.random.Generator) -> None:

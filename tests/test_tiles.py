@@ -58,7 +58,7 @@ def test_cells_give_what_the_whole_gives(name: str, tmp_path: Path) -> None:
     std_spacings, settings, seed = CASES[name]
     noisy = cloud("torus", 5000, std_spacings, seed)
     rng = np.random.default_rng(seed)
-    measured = varied(noisy, 0.6, 2.2)[0] if "grows" in name else noisy.noisy
+    measured = varied(noisy, 0.5, 3.0)[0] if "grows" in name else noisy.noisy
     points = np.concatenate([measured, measured[:20], np.full((3, 3), np.nan)])[rng.permutation(5023)] + UTM
     config = DenoiseConfig(threads=1, **settings)
     whole = denoiser.denoise(points, None if config.method != "network" else model("seeded"), config)

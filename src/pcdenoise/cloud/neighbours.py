@@ -149,6 +149,12 @@ def drawn_by(identity: NDArray[np.uint64], seed: int) -> NDArray[np.uint64]:
     return _mixed(identity ^ _mixed(np.full(1, np.uint64(seed) + np.uint64(0x9E3779B97F4A7C15), dtype=np.uint64)))
 
 
+def is_drawn(drawn: NDArray[np.uint64], share: float | NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(N,) who belongs to a share of all points, or is drawn with a chance of its own (N,), by numbers as of `drawn_by`."""
+    chosen: NDArray[np.bool_] = drawn <= (np.minimum(share, 1.0) * float(2**64 - 2**11)).astype(np.uint64)
+    return chosen
+
+
 def _mixed(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """The finaliser of splitmix64: every bit of the result depends on every bit given."""
     state = (state ^ state >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)

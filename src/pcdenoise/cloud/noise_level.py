@@ -1,9 +1,10 @@
-"""How noisy a cloud is and at what scale its surface shows. Not here: what is done about it (denoising)."""
+"""How noisy a cloud is, as a whole and by place, and at what scale its surface shows. Not here: what is done about it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from pcdenoise.cloud.neighbours import (
     coordinate_hash,
     distinct,
     drawn_by,
+    is_drawn,
     principal_axes,
     spatial_order,
 )
@@ -104,13 +106,13 @@ Nearest = Callable[[Points, int], tuple[Distances, Points]]
 
 def estimate_from(probed: Points, n_points: int, nearest: Nearest, known_std: float | None = None) -> NoiseLevel:
     """`estimate` at (M, 3) probes of a cloud that only `nearest` knows; it is asked for up to 2048 neighbours."""
-    is_known = known_std is not None
+    level = partial(NoiseLevel, is_known=known_std is not None, n_points=n_points)
     if n_points < 2:
-        return NoiseLevel(known_std or 0.0, 0.0, float(_LADDER[0]), False, is_known, n_points)
+        return level(known_std or 0.0, 0.0, float(_LADDER[0]), False)
     probed = probed[spatial_order(probed)]
     spacing = float(np.median(nearest(probed, 2)[0][:, 1]))
     if n_points < _LADDER[0]:
-        return NoiseLevel(known_std or 0.0, spacing, float(_LADDER[0]), False, is_known, n_points)
+        return level(known_std or 0.0, spacing, float(_LADDER[0]), False)
 
     rungs: list[_Rung] = []
     for k in (k for k in _LADDER if k <= n_points):
@@ -126,10 +128,10 @@ def estimate_from(probed: Points, n_points: int, nearest: Nearest, known_std: fl
     shown = [rung for rung in rungs if rung.aspect >= _SURFACE_ASPECT]
     if not shown:
         std = known_std or max(rungs, key=lambda rung: rung.aspect).std
-        return NoiseLevel(std, spacing, float(_LADDER[0]), False, is_known, n_points)
+        return level(std, spacing, float(_LADDER[0]), False)
     std = known_std or shown[0].std
     certain = shown[0].k <= _SMALL_SHARE * n_points or max(rung.aspect for rung in shown) >= _CERTAIN_ASPECT
-    return NoiseLevel(std, spacing, _points_within(_SCALE_STDS * std, rungs), certain, is_known, n_points)
+    return level(std, spacing, _points_within(_SCALE_STDS * std, rungs), certain)
 
 
 def around(points: Points, level: NoiseLevel, at: Points | None = None, seed: int = 0, threads: int = -1) -> NDArray[np.float64]:
@@ -173,12 +175,12 @@ def _readings(points: Points, drawn: NDArray[np.uint64], level: NoiseLevel, thre
     none does, or only so large a share of the cloud that it may be a thin part. Of large ones a share of the points is looked at.
     """
     looked_at = _share_looked_at(level)
-    places = points[drawn <= _threshold(looked_at * _share_of_places(level))]
+    places = points[is_drawn(drawn, looked_at * _share_of_places(level))]
     std = np.full(len(places), np.nan)
     for times in (1, 2, 4, 8):
         looked_at, left = _share_looked_at(level, times), np.flatnonzero(np.isnan(std))
         k = max(_LADDER[1], round(looked_at * times * level.scale_points))
-        cloud = points[drawn <= _threshold(looked_at)]
+        cloud = points[is_drawn(drawn, looked_at)]
         if not len(left) or k > len(cloud) or (times > 1 and k > _SMALL_SHARE * looked_at * level.n_points):
             break
         search = NeighbourSearch(cloud, threads)
@@ -189,11 +191,6 @@ def _readings(points: Points, drawn: NDArray[np.uint64], level: NoiseLevel, thre
             shown = aspect >= (_SURFACE_ASPECT if level.is_surface else _CERTAIN_ASPECT)
             std[block[shown]] = (radius / aspect)[shown] / np.interp(aspect[shown], *_SEEN)
     return places, std
-
-
-def _threshold(share: float) -> np.uint64:
-    """Of random numbers a share is at most so large."""
-    return np.uint64(share * float(2**64 - 2**11))
 
 
 def _share_looked_at(level: NoiseLevel, times: float = 1) -> float:
@@ -221,8 +218,8 @@ def _spread(places: Points, std: NDArray[np.float64], at: Points, level: NoiseLe
         averaged = (known * np.nan_to_num(values[index])).sum(axis=1) / np.maximum(share, 1e-300)
         return np.where(share >= 0.5 * weight.sum(axis=1), averaged, np.nan)
 
-    around = round(_POINTS_AROUND * _share_of_places(level))
-    return np.exp(mean(at, 3, mean(places, around, np.log(np.maximum(std, 1e-300)))))
+    n_around = round(_POINTS_AROUND * _share_of_places(level))
+    return np.exp(mean(at, 3, mean(places, n_around, np.log(np.maximum(std, 1e-300)))))
 
 
 def _points_within(radius: float, rungs: list[_Rung]) -> float:

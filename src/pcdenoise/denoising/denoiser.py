@@ -277,12 +277,12 @@ def one_pass(
 
     Strength and limit are not applied.
     """
-    noise: float | NDArray[np.float64] = level.std
     if config.method != "network":
         moved = _filtered(points, level, diagonal, config, threads)
         return _unshrunk(points, moved, diagonal, config) if config.unshrink else moved
     if model is None:
         raise UsageError("--method network needs a model; give --model, or choose --method jet")
+    noise: float | NDArray[np.float64] = level.std
     if isinstance(model.config.settings, ProjectionSettings):
         moved, noise = network_pass.projection(points, identity, level, model, config.seed, threads, on_share)
         moved = _unshrunk(points, moved, diagonal, config) if config.unshrink else moved

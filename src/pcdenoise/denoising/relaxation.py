@@ -137,8 +137,7 @@ class _Sheet:
         offset = current[others] - current[rows, None]
         agreement = np.einsum("mkc,mc->mk", self.normal[others], upright) ** 2
         nearness = 2 * agreement / np.maximum((offset**2).sum(axis=2), 1e-300)
-        first = self.points[self.index[rows, 1]] - self.points[rows]
-        first -= (first * upright).sum(axis=1, keepdims=True) * upright
+        first = _flattened(self.points[self.index[rows, 1]] - self.points[rows], upright)
         first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-300)
         second = np.cross(upright, first)
         along = (nearness * np.einsum("mkc,mc->mk", offset, axis) for axis in (first, second))
@@ -151,8 +150,7 @@ class _Sheet:
         to_centre = sum(
             ((third * wave).sum(axis=1) / area)[:, None] * axis for wave, axis in zip(_WAVES, (first, second), strict=True)
         )
-        back, held = self.points[rows] - current[rows], self.held[rows, None]
-        back -= (back * upright).sum(axis=1, keepdims=True) * upright
+        back, held = _flattened(self.points[rows] - current[rows], upright), self.held[rows, None]
         after[rows] = current[rows] + self.sheet[rows, None] * (to_centre + held * back) / (1 + held)
 
     def _land(self, current: Points, rows: slice, after: Points) -> None:
@@ -164,6 +162,12 @@ class _Sheet:
         over = np.einsum("mk,mkc,mc->m", weight, offset, upright)[:, None] * upright
         under = np.einsum("mk,mk,mkc->mc", weight, (offset * theirs).sum(axis=2), theirs)
         after[rows] = current[rows] + 0.5 * self.sheet[rows, None] * (under + over)
+
+
+def _flattened(vectors: Points, normal: Points) -> Points:
+    """(M, 3) what is left of vectors in the planes across (M, 3) unit normals."""
+    flat: Points = vectors - (vectors * normal).sum(axis=1, keepdims=True) * normal
+    return flat
 
 
 class _Compiled(_Sheet):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdenoise.cloud.neighbours import Identity, Indices, NeighbourSearch, coordinate_hash, drawn_by
+from pcdenoise.cloud.neighbours import Identity, Indices, NeighbourSearch, coordinate_hash, drawn_by, is_drawn
 from pcdenoise.cloud.noise_level import NoiseLevel
 from pcdenoise.cloud.scan import Points
 
@@ -73,8 +73,7 @@ def coarsen(
     most = share if noisier is None else min(_MOST_MORE * share, max(_APART.values()))
     apart = max((n for n, left in _APART.items() if left >= most), default=1)
     drawn = drawn_by(coordinate_hash(points, 0) if identity is None else identity, seed)
-    shares = np.full(len(points), share) if noisier is None else np.minimum(share / noisier, most)
-    is_candidate = drawn < (np.minimum(shares / _APART[apart], 1.0) * float(2**64 - 2**11)).astype(np.uint64)
+    is_candidate = is_drawn(drawn, np.minimum(share / (1.0 if noisier is None else noisier), most) / _APART[apart])
     candidates = points[is_candidate]
     if len(candidates) <= apart + 1:
         return Seeds(points, np.ones(len(points)), np.arange(len(points)))
