@@ -179,7 +179,9 @@ def test_recomputing_large_layers_changes_no_gradient(rng: np.random.Generator, 
         model = network().train()
         model(points, np.random.default_rng(3)).square().sum().backward()
         gradients.append(torch.cat([p.grad.flatten() for p in model.parameters() if p.grad is not None]))
-    torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-4, atol=1e-10)
+    # sums of thousands of terms in single precision, of which some cancel: the rounding is that of the largest
+    largest = float(gradients[0].abs().max())
+    torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-4, atol=1e-6 * largest)
 
 
 def test_some_steps_of_training_learn_to_denoise_a_sphere(rng: np.random.Generator) -> None:
