@@ -38,6 +38,9 @@ def test_verify_fails_with_5_for_a_sphere_that_shrank_and_passes_without_the_gat
     assert main(["verify", before, after, "--max-drift", "0.3"]) == 5
     assert "drifted by" in capsys.readouterr().err
     assert main(["verify", before, after, "--max-drift", "100"]) == 0
+    for noise, code in ((findings["drift"] / 0.35, 5), (findings["drift"] / 0.25, 0)):
+        assert main(["verify", before, after, "--max-drift", "0.3", "--noise", str(noise)]) == code
+    assert main(["verify", before, after, "--noise", "0"]) == 2
 
 
 def test_denoise_writes_nothing_that_drifts_beyond_the_gate(sphere: tuple[Path, Path], tmp_path: Path) -> None:

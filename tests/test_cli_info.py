@@ -98,6 +98,21 @@ def test_traps_are_named_and_an_ordinary_scan_has_none(tmp_path: Path) -> None:
         assert words in warnings_of(pcdenoise.read(path))
 
 
+def test_depths_of_a_camera_are_taken_for_rounded_and_a_grid_or_a_plan_with_storeys_is_not() -> None:
+    """Depth by disparity, of a wavy wall, 60 to 70 of its steps; a grid of heights; ten storeys without noise."""
+    u, v = (axis.ravel() for axis in np.meshgrid(np.arange(300.0), np.arange(200.0)))
+    disparity = np.rint(65 + 5 * np.sin(u / 60) * np.cos(v / 50))
+    depth = 65 / disparity
+    camera = np.column_stack([u * depth / 300, v * depth / 300, depth])
+    said = warnings_of(Scan(camera))
+    std = np.sqrt(np.mean((65 / disparity**2) ** 2 / 12))
+    assert "z was rounded" in said
+    assert float(said.split("--noise ")[1].split()[0]) == pytest.approx(std, rel=0.15)
+    waves = np.sin(u / 60) * np.cos(v / 50)
+    for scan in (Scan(np.column_stack([u, v, waves])), Scan(np.column_stack([u, v, 5 * (v // 20) + 1e-3 * waves]))):
+        assert "rounded" not in warnings_of(scan)
+
+
 def test_a_step_that_swallows_moves_is_that_of_a_las_and_of_nothing_else(tmp_path: Path) -> None:
     """A plane whose noise is half of the coarsest step of the file; a text of the same numbers gets the decimals it needs."""
     sample = cloud("plane", 4000, 0.5)

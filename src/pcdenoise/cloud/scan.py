@@ -42,7 +42,7 @@ class Scan:
     attributes: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     format: str = "xyz"
     origin: str = "<memory>"
-    source: Any = None
+    source: Any = field(default=None, repr=False)
     added: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

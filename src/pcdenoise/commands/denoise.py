@@ -35,10 +35,6 @@ Unshrink = Annotated[
     bool | None,
     option("--unshrink/--shrink", help="Take moves that whole regions share back; by default with mcconv models only."),
 ]
-Noise = Annotated[
-    float | None,
-    option("--noise", metavar="STD", help="Noise as a standard deviation in the file's unit; estimated if not given."),
-]
 Iters = Annotated[str, option("--iters", metavar="N|auto", help="Passes; auto stops when the next would not help.")]
 
 _UNTOLD = Path("?")
@@ -51,7 +47,7 @@ def denoise(
     model: options.Model = None,
     method: Method = "network",
     iters: Iters = "1",
-    noise: Noise = None,
+    noise: options.Noise = None,
     unshrink: Unshrink = None,
     neighbours: Neighbours = None,
     radius: Radius = None,

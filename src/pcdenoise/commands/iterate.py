@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pcdenoise.commands import options, outputs
 from pcdenoise.commands.cleaning import chosen_model, named_model
 from pcdenoise.commands.console import Console, counted, figure, table
-from pcdenoise.commands.denoise import Iters, Method, Neighbours, Noise, Radius, SigmaD, SigmaN, Unshrink
+from pcdenoise.commands.denoise import Iters, Method, Neighbours, Radius, SigmaD, SigmaN, Unshrink
 from pcdenoise.commands.eval_chamfer import points_to_compare
 from pcdenoise.commands.files import format_of, refuse_existing, refuse_file, target_name
 from pcdenoise.commands.options import argument, configured, option
@@ -25,7 +25,7 @@ def iterate(
     model: options.Model = None,
     method: Method = "network",
     iters: Iters = "5",
-    noise: Noise = None,
+    noise: options.Noise = None,
     unshrink: Unshrink = None,
     neighbours: Neighbours = None,
     radius: Radius = None,

@@ -178,6 +178,10 @@ Report = Annotated[
 Picture = Annotated[
     str, option("--picture", callback=picture_known, metavar="OUT", help="Write a .png picture: a file, or a folder for several.")
 ]
+Noise = Annotated[
+    float | None,
+    option("--noise", metavar="STD", help="Noise as a standard deviation in the file's unit; estimated if not given."),
+]
 Overwrite = Annotated[bool, option("--overwrite", help="Replace files that exist.")]
 Seed = Annotated[int, common("--seed", min=0, help="Same seed, same bytes.")]
 Threads = Annotated[int | None, common("--threads", min=1, help="Threads to use; all cores if not given.")]

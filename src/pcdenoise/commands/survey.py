@@ -27,6 +27,9 @@ _MOST_JUDGED = 200_000  # points of which outliers are counted
 _BLOCKS = 4  # compact parts of the cloud that they are taken from
 _MANY_OUTLIERS = 1e-3
 _MOST_DEGREES = (180.0, 90.0)
+_LEAST_DEPTHS, _POINTS_PER_DEPTH, _DEPTHS_NEARBY = 8, 200, 2
+"""Depths are rounded where there are so many at least, each of so many points on average, no more of them around most points."""
+_DEPTH_PROBES = 500
 
 
 def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
@@ -144,10 +147,40 @@ def traps(scan: Scan, noise: float | None) -> list[str]:
         return said
     if (step := io.coordinate_step(scan)) and noise < step:
         said.append(f"the noise is below the file's step of {step:g}, and moves below half of it vanish; write .ply to keep them")
-    if (step := _float32_step(points)) > noise / 4:
+    rounded = {axis: step for axis, step in _rounded_depths(points).items() if noise < _rounding_std(step) / 2}
+    for axis, step in rounded.items():
+        fix = f"--noise {_rounding_std(step):.2g} tells how far off they are"
+        said.append(f"{axis} was rounded, in steps of {step:.2g} at most points, so that neighbours show no noise; {fix}")
+    if (step := _float32_step(points)) > noise / 4 and not rounded:
         fix = "export from the source in float64, or with an offset"
         said.append(f"coordinates were rounded to float32, in steps of {step:g} so far from the origin; {fix}")
     return said
+
+
+def _rounding_std(step: float) -> float:
+    """Of what is rounded to multiples of a step."""
+    return step / math.sqrt(12)
+
+
+def _rounded_depths(points: Points) -> dict[str, float]:
+    """Axes along which all points lie on few planes, as depth cameras measure, and the distance between planes at most points.
+
+    A regular grid lies on few planes as well, but a point of it has neighbours on several of them.
+    """
+    import numpy as np
+
+    from pcdenoise.cloud.neighbours import NeighbourSearch
+
+    found: dict[str, float] = {}
+    for axis, values in zip("xyz", points.T, strict=True):
+        planes, plane = np.unique(values, return_inverse=True)
+        if not _LEAST_DEPTHS <= len(planes) <= len(points) / _POINTS_PER_DEPTH:
+            continue
+        probes = points[np.linspace(0, len(points) - 1, _DEPTH_PROBES).astype(int)]
+        near = np.sort(values[NeighbourSearch(points).knn(probes, N_NEIGHBOURS)[1]], axis=1)
+        if np.median((np.diff(near, axis=1) > 0).sum(axis=1) + 1) <= _DEPTHS_NEARBY:
+            found[axis] = float(np.median(np.gradient(planes)[plane]))
+    return found
 
 
 def _misfit(system: Crs, points: Points) -> str:

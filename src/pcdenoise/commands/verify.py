@@ -32,6 +32,7 @@ def verify(
         float | None, option("--max-move", min=0, help="Fail if a point moved farther, in the file's unit, rounding apart.")
     ] = None,
     max_drift: MaxDrift = None,
+    noise: options.Noise = None,
     format: options.FormatRead = None,
     as_json: options.Json = False,
     config: options.Config = None,
@@ -44,9 +45,11 @@ def verify(
     Example: pcdenoise verify scan.laz clean.laz --max-move 0.05 --max-drift 0.3
     """
     from pcdenoise import io
+    from pcdenoise.config import DenoiseConfig
 
+    noise = options.configured(DenoiseConfig, noise=noise).noise
     cleaned = io.read(after, format=format_of(after, format))
-    findings = compare(io.read(before, format=format_of(before, format)), cleaned)
+    findings = compare(io.read(before, format=format_of(before, format)), cleaned, noise)
     print(json.dumps(findings, indent=2) if as_json else _as_text(findings))
     if findings["lost"]:
         raise GateError(f"{after}: not everything of {before} survived: {'; '.join(findings['lost'])}")
@@ -64,8 +67,11 @@ def check_drift(path: Path, drift: float, noise: float, limit: float | None) -> 
         raise GateError(f"{path}: the surface drifted by {figure(drift)}{share}; the limit is {figure(limit)}; {fix}")
 
 
-def compare(before: Scan, after: Scan) -> dict[str, Any]:
-    """What two scans share: attributes row by row, what is beside them, distances moved, drift, and a list of what was lost."""
+def compare(before: Scan, after: Scan, noise: float | None = None) -> dict[str, Any]:
+    """What two scans share: attributes row by row, what is beside them, distances moved, drift, and a list of what was lost.
+
+    noise: the standard deviation that there was, in the scans' unit, where somebody knows it; else it is estimated.
+    """
     import numpy as np
 
     from pcdenoise.cloud import drift, noise_level
@@ -97,7 +103,7 @@ def compare(before: Scan, after: Scan) -> dict[str, Any]:
         lost.append("rows without numbers (NaN, infinite) are not the same rows")
     both = before.finite & after.finite
     move = np.linalg.norm(after.points[both] - before.points[both], axis=1)
-    level = noise_level.estimate(before.points[both])
+    noise = noise or noise_level.estimate(before.points[both]).std
     drifted = drift.measure(before.points[both], after.points[both])
     return {
         "rows": [len(before), len(after)],
@@ -112,7 +118,7 @@ def compare(before: Scan, after: Scan) -> dict[str, Any]:
         },
         "drift": drifted.size,
         "drift_inward": drifted.inward,
-        "noise_before": level.std,
+        "noise_before": noise,
         "lost": lost,
     }
 
