@@ -2,6 +2,8 @@
 PYTHON ?= python3
 PIP := .venv/bin/python -m pip --disable-pip-version-check
 BIN := .venv/bin
+# pip does this for what it copies, but not for what it links to; without it every start of the program takes 0.2 CPU s more.
+COMPILE := @$(BIN)/python -m compileall -q src
 COMPILED := $(wildcard src/pcdenoise/*/*.[ch])
 
 .DEFAULT_GOAL := help
@@ -54,8 +56,10 @@ clean: ## remove .venv and what demo and bench wrote
 
 .venv/run.stamp: .venv/bin/python pyproject.toml constraints.txt $(COMPILED)
 	$(PIP) install -q -c constraints.txt -e .
+	$(COMPILE)
 	@touch $@
 
 .venv/dev.stamp: .venv/bin/python pyproject.toml constraints.txt $(COMPILED)
 	$(PIP) install -q -c constraints.txt -e '.[dev]'
+	$(COMPILE)
 	@touch $@ .venv/run.stamp

@@ -52,6 +52,49 @@ def test_neighbours_of_other_places_are_the_nearest_of_all(points: np.ndarray, q
     np.testing.assert_array_equal(distances, np.take_along_axis(every, indices, axis=1))
 
 
+CLOUDS = {
+    "a volume": lambda rng: rng.standard_normal((700, 3)),
+    "a sheet far away": lambda rng: rng.random((700, 3)) * [1, 1, 1e-3] + [5e5, 5e6, 100],
+    "a line": lambda rng: rng.random((700, 1)) * [1.0, 2.0, 3.0],
+    "a grid": lambda rng: rng.permutation(np.argwhere(np.ones((9, 9, 9))).astype(float))[:700],
+    "one place": lambda rng: np.full((700, 3), 7.0),
+    "a crowd and one far off": lambda rng: np.concatenate([1e-9 * rng.random((699, 3)), np.full((1, 3), 1e9)]),
+}
+
+
+@pytest.mark.parametrize("is_built", [True, False])
+@pytest.mark.parametrize("kind", CLOUDS)
+def test_neighbours_in_clouds_of_any_kind_are_those_of_brute_force(
+    kind: str, is_built: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Compiled and not, near and far queries, in spatial order and out of it; compiled, equally near ones come by row."""
+    if is_built and not neighbours.IS_BUILT:
+        pytest.skip("was installed where no C compiler is")
+    monkeypatch.setattr(neighbours, "IS_BUILT", is_built)
+    points = CLOUDS[kind](rng)
+    queries = np.concatenate([points[spatial_order(points)], points[:50], points[:50] + rng.standard_normal((50, 3))])
+    every = all_distances(queries, points)
+    search = NeighbourSearch(points, threads=2)
+    for k in (1, 2, 12, 33, 300, 700):
+        distances, rows = search.knn(queries, k)
+        np.testing.assert_allclose(distances, np.sort(every, axis=1)[:, :k], rtol=1e-12)
+        np.testing.assert_allclose(distances, np.take_along_axis(every, rows, axis=1), rtol=1e-12)
+        assert (np.diff(np.sort(rows, axis=1), axis=1) > 0).all()
+    if is_built and kind in ("a grid", "one place"):
+        np.testing.assert_array_equal(search.knn(queries, 700)[1][:750], np.argsort(every[:750], axis=1, kind="stable"))
+
+
+@pytest.mark.skipif(not neighbours.IS_BUILT, reason="was installed where no C compiler is")
+def test_what_is_no_number_has_no_neighbours_and_is_none(rng: np.random.Generator) -> None:
+    points = rng.random((300, 3))
+    points[[3, 50, 51]] = [[np.nan] * 3, [np.inf, 0, 0], [1e200, 0, 0]]
+    distances, rows = NeighbourSearch(points, threads=1).knn(points, 5)
+    numbers = np.delete(np.arange(300), [3, 50, 51])
+    assert set(rows[numbers].ravel().tolist()) == set(numbers.tolist())
+    assert (rows[3] == 300).all()
+    assert np.isinf(distances[[3, 50]]).all()
+
+
 @settings(max_examples=40, deadline=None)
 @given(points=on_grid, seed=st.integers(0, 99))
 def test_distances_to_neighbours_follow_their_rows_in_any_order(points: np.ndarray, seed: int) -> None:

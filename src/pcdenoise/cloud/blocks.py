@@ -1,10 +1,17 @@
-"""Work on all rows of a cloud in blocks that fit the cache, spread over threads. Not here: what is done with a block."""
+"""Work on all rows of a cloud in blocks that fit the cache, spread over threads, and arrays for compiled code.
+
+Not here: what is done with a block.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 BLOCK_POINTS = 1024
 """What is known of so many points and their neighbours fits the cache; half as many cost more in calls than the cache saves."""
@@ -24,3 +31,15 @@ def each_block(work: Callable[[slice], None], n: int, threads: int, block_points
 def blocks(n: int, block_points: int) -> list[slice]:
     """The rows of n points, so many at a time."""
     return [slice(i, min(i + block_points, n)) for i in range(0, n, block_points)]
+
+
+def address(values: NDArray[Any] | None, kind: type[np.generic]) -> int:
+    """Where the numbers of an array lie, for compiled code, which takes them as they are; 0 for none.
+
+    Raises TypeError for numbers of another kind and for those that do not lie row by row.
+    """
+    if values is None:
+        return 0
+    if values.dtype != kind or not values.flags.c_contiguous:
+        raise TypeError(f"compiled code takes dense arrays of {kind.__name__}, not {values.dtype} with strides {values.strides}")
+    return values.ctypes.data

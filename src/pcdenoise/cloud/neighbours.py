@@ -1,4 +1,8 @@
-"""Who is near whom: spatial order, nearest neighbours, how they lie, pairs within a radius. Not here: what is done with them."""
+"""Who is near whom: spatial order, nearest neighbours, how they lie, pairs within a radius. Not here: what is done with them.
+
+Neighbours are found by compiled code (neighbours.c) where a C compiler was when the program was installed, else by SciPy, whose
+import alone takes as long as a small scan; so it is imported where it is used.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,16 @@ from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from pcdenoise.cloud.blocks import address, each_block
 from pcdenoise.cloud.scan import Points
+
+try:
+    from pcdenoise.cloud import _neighbours
+except ImportError:
+    IS_BUILT = False
+else:
+    IS_BUILT = True
 
 Indices = NDArray[np.int64]
 Distances = NDArray[np.float64]
@@ -17,7 +28,7 @@ Identity = NDArray[np.uint64]
 
 PAIRS_AT_ONCE = 2**20
 """About how many pairs are in memory at a time."""
-_QUERIES = 1 << 16  # asked at once where only the answer's row numbers stay
+_QUERIES = 1 << 12  # answered in a row by one thread
 _BITS = 21  # per axis: three axes fill 63 bits of one Morton code
 
 
@@ -50,25 +61,64 @@ def _spread_bits(value: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 class NeighbourSearch:
-    """A k-d tree over (N, 3) finite points; fastest when they are in `spatial_order`."""
+    """A k-d tree over (N, 3) finite points; fastest when they, and those who ask, are in `spatial_order`."""
 
     def __init__(self, points: Points, threads: int = -1) -> None:
         self.n_points = len(points)
         self.threads = threads
-        self._tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+        self._tree: _Compiled | _Tree = (_Compiled if IS_BUILT and 0 < len(points) < 2**31 else _Tree)(points)
 
     def knn(self, queries: Points, k: int) -> tuple[Distances, Indices]:
         """(M, k) distances and row numbers of the nearest points, nearest first; k is cut to N. Needs N >= 1."""
-        k = min(k, self.n_points)
-        distances, indices = self._tree.query(queries, k=np.arange(1, k + 1), workers=self.threads)
-        return distances, indices.astype(np.int64, copy=False)
+        shape = len(queries), min(k, self.n_points)
+        distances, indices = np.empty(shape), np.empty(shape, np.int64)
+        self._answer(queries, indices, distances)
+        return distances, indices
 
     def nearest(self, queries: Points, k: int) -> NDArray[np.int32]:
         """(M, k) row numbers alone, at a third of the memory."""
-        found = np.empty((len(queries), min(k, self.n_points)), np.int32)
-        for start in range(0, len(queries), _QUERIES):
-            found[start : start + _QUERIES] = self.knn(queries[start : start + _QUERIES], k)[1]
-        return found
+        indices = np.empty((len(queries), min(k, self.n_points)), np.int32)
+        self._answer(queries, indices, None)
+        return indices
+
+    def _answer(self, queries: Points, indices: NDArray[np.signedinteger], distances: Distances | None) -> None:
+        queries = np.ascontiguousarray(queries, np.float64)
+        each_block(lambda rows: self._tree.answer(queries, rows, indices, distances), len(queries), self.threads, _QUERIES)
+
+
+class _Tree:
+    """SciPy's."""
+
+    def __init__(self, points: Points) -> None:
+        from scipy.spatial import cKDTree
+
+        self._tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+
+    def answer(self, queries: Points, rows: slice, indices: NDArray[np.signedinteger], distances: Distances | None) -> None:
+        """Writes the rows of the points nearest to some of (M, 3) queries, and their distances if wanted, into (M, k) arrays."""
+        found = self._tree.query(queries[rows], k=np.arange(1, indices.shape[1] + 1))
+        indices[rows] = found[1]
+        if distances is not None:
+            distances[rows] = found[0]
+
+
+class _Compiled:
+    """Ours, which gives equally near points by row."""
+
+    def __init__(self, points: Points) -> None:
+        points = np.ascontiguousarray(points, np.float64)
+        self._axes, self._rows = np.empty((3, len(points))), np.empty(len(points), np.int32)
+        self._boxes = np.empty((_neighbours.n_nodes(len(points)), 6))
+        self._parts = address(self._axes, np.float64), address(self._rows, np.int32), address(self._boxes, np.float64)
+        _neighbours.plant(address(points, np.float64), len(points), *self._parts)
+
+    def answer(self, queries: Points, rows: slice, indices: NDArray[np.signedinteger], distances: Distances | None) -> None:
+        """The same."""
+        is_narrow = indices.dtype == np.int32
+        narrow, wide = (address(indices, np.int32), 0) if is_narrow else (0, address(indices, np.int64))
+        tree = *self._parts, len(self._rows)
+        asked = address(queries, np.float64), rows.start, rows.stop, indices.shape[1]
+        _neighbours.nearest(tree, *asked, address(distances, np.float64), narrow, wide)
 
 
 def knn(points: Points, k: int, queries: Points | None = None, threads: int = -1) -> tuple[Distances, Indices]:
@@ -94,6 +144,8 @@ def principal_axes(centred: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def radius_pairs(points: Points, radius: float) -> Indices:
     """(P, 2) rows i < j of all pairs of (N, 3) finite points at most `radius` apart, in no particular order."""
+    from scipy.spatial import cKDTree
+
     order = spatial_order(points)
     pairs = order[cKDTree(points[order], balanced_tree=False, compact_nodes=False).query_pairs(radius, output_type="ndarray")]
     return np.sort(pairs, axis=1)
@@ -107,6 +159,8 @@ def thinned(sources: Points, targets: Points, radius: float, n: int, rng: np.ran
 
 def pairs_within(sources: Points, targets: Points, radius: float) -> Iterator[tuple[Indices, Indices]]:
     """(target, source) rows of all pairs within the radius, sorted by target; some targets at a time, so memory is bounded."""
+    from scipy.spatial import cKDTree
+
     n_targets = max(1, int(PAIRS_AT_ONCE / _mean_count(sources, targets, radius)))
     tree = cKDTree(sources)
     for start in range(0, len(targets), n_targets):
@@ -118,6 +172,8 @@ def pairs_within(sources: Points, targets: Points, radius: float) -> Iterator[tu
 
 def _mean_count(sources: Points, targets: Points, radius: float) -> float:
     """About how many sources lie within the radius of a target, at least one."""
+    from scipy.spatial import cKDTree
+
     probes = targets[:: max(1, len(targets) // 256)]
     counts = cKDTree(sources).query_ball_point(probes, radius, return_length=True)
     return float(np.maximum(np.mean(counts), 1)) if len(probes) else 1.0

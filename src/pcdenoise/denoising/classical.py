@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pcdenoise.cloud import noise_level
-from pcdenoise.cloud.neighbours import Distances, Indices, NeighbourSearch, spatial_order
+from pcdenoise.cloud.neighbours import Distances, Indices, NeighbourSearch, knn, spatial_order
 from pcdenoise.cloud.noise_level import NoiseLevel
 from pcdenoise.cloud.scan import Points
 from pcdenoise.errors import UsageError
@@ -150,7 +149,7 @@ def tune(pairs: Sequence[tuple[Points, Surface]], method: str, *, threads: int =
 def _mean_distance(points: Points, clean: Surface) -> float:
     if callable(clean):
         return float(clean(points).mean())
-    return float(cKDTree(clean).query(points)[0].mean() + cKDTree(points).query(clean)[0].mean())
+    return float(knn(clean, 1, points)[0].mean() + knn(points, 1, clean)[0].mean())
 
 
 def _positive_count(name: str, value: int) -> int:

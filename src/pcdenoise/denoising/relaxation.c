@@ -4,7 +4,7 @@
 
 #include <Python.h>
 
-#include "../networks/geometry.h"
+#include "../cloud/geometry.h"
 
 #define MOST_DIRECTIONS 32
 

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdenoise.cloud.blocks import each_block
+from pcdenoise.cloud.blocks import address, each_block
 from pcdenoise.cloud.neighbours import NeighbourSearch, pairs_within, thinned
 from pcdenoise.cloud.scan import Points, within
-from pcdenoise.networks.fused import address
 
 try:
     from pcdenoise.denoising import _relaxation

@@ -6,7 +6,7 @@
 
 #include <Python.h>
 
-#include "geometry.h"
+#include "../cloud/geometry.h"
 
 #define CHANNELS 32
 #define LANES 8

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdenoise.cloud.blocks import BLOCK_POINTS, each_block
+from pcdenoise.cloud.blocks import BLOCK_POINTS, address, each_block
 from pcdenoise.cloud.neighbours import NeighbourSearch
 from pcdenoise.cloud.scan import Points
 from pcdenoise.errors import ModelError
@@ -194,18 +193,6 @@ def checked_finite(points: Points) -> Points:
 
 def _empty(*shape: int) -> Values:
     return np.empty(shape, np.float32)
-
-
-def address(values: NDArray[Any] | None, kind: type[np.generic]) -> int:
-    """Where the numbers of an array lie, for compiled code, which takes them as they are; 0 for none.
-
-    Raises TypeError for numbers of another kind and for those that do not lie row by row.
-    """
-    if values is None:
-        return 0
-    if values.dtype != kind or not values.flags.c_contiguous:
-        raise TypeError(f"compiled code takes dense arrays of {kind.__name__}, not {values.dtype} with strides {values.strides}")
-    return values.ctypes.data
 
 
 def _at(values: Values | None) -> int:
