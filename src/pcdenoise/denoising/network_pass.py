@@ -42,7 +42,8 @@ def projection(
     noise = by_place(points, identity, level, threads)
     seeds, count, cell, raw, seed_noise = points, None, np.arange(len(points)), None, noise
     if share < 1:
-        coarse = coarsen(points, share, seed, threads, identity, times_noisier(noise, level, sizes.neighbours))
+        noisier = None if level.is_known else times_noisier(noise, level, sizes.neighbours)
+        coarse = coarsen(points, share, seed, threads, identity, noisier)
         seeds, count, cell, raw, seed_noise = coarse.points, coarse.count, coarse.cell, points, coarse.means(noise)
     total = len(seeds) * sum(sizes.rounds) + (len(points) * sizes.landing_rounds if share < 1 else 0)
     done, counting = 0, Lock()
