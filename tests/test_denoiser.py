@@ -17,9 +17,9 @@ from known_clouds import UTM, Cloud, cloud, model, moves, rotation, varied
 from pcdenoise import io
 from pcdenoise.cloud import neighbours
 from pcdenoise.cloud.neighbours import coordinate_hash, knn
-from pcdenoise.cloud.noise_level import estimate
+from pcdenoise.cloud.noise_level import NoiseLevel, estimate
 from pcdenoise.config import DenoiseConfig
-from pcdenoise.denoising import network_pass, pyramid, relaxation, risk
+from pcdenoise.denoising import denoiser, network_pass, pyramid, relaxation, risk
 from pcdenoise.denoising.denoiser import Result, denoise, iterate, level_of
 from pcdenoise.denoising.risk import Risk
 from pcdenoise.denoising.seeds import share_of_seeds
@@ -304,6 +304,23 @@ def test_any_small_cloud_comes_back_with_its_rows_and_finite_where_it_was(points
 
 
 # Settings
+
+
+def test_draws_are_averaged_over_seeds_of_their_own_and_what_is_left_is_less(coarse: Cloud) -> None:
+    """The mean of as many runs under one level; where every point is its own seed nothing is drawn."""
+    level = level_of(coarse.noisy, PLAIN)
+
+    def moved(cloud: Cloud, level: NoiseLevel, **settings: int) -> np.ndarray:
+        return denoise(cloud.noisy, model("seeded"), PLAIN.model_copy(update={"relax_steps": 0, **settings}), level=level).points
+
+    assert share_of_seeds(level, 32) < 1
+    single = [moved(coarse, level, seed=seed) for seed in (0, denoiser._DRAWS_APART)]
+    together = moved(coarse, level, draws=2)
+    np.testing.assert_allclose(together, np.mean(single, axis=0), atol=1e-12)
+    assert coarse.error(together) < min(coarse.error(points) for points in single)
+    fine = cloud("sphere", 2000, 0.2)
+    level = level_of(fine.noisy, PLAIN)
+    np.testing.assert_array_equal(moved(fine, level, draws=3), moved(fine, level))
 
 
 def test_no_strength_is_no_move_and_half_of_it_half_the_way(coarse: Cloud, coarse_result: Result) -> None:

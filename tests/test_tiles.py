@@ -42,6 +42,7 @@ CASES = {
     "little noise": (0.3, {}, 1),
     "seeds are drawn": (1.0, {}, 1),
     "another seed": (1.0, {"seed": 5}, 2),
+    "several draws": (1.0, {"draws": 3}, 2),
     "passes after passes": (1.0, {"iters": 3, "relax_steps": 0}, 3),
     "until it stops by itself": (0.5, {"iters": "auto"}, 4),
     "noise that grows along the cloud": (0.8, {}, 4),

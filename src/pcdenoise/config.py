@@ -26,6 +26,9 @@ class DenoiseConfig(Settings):
     iters: Annotated[int, Field(ge=1, le=100)] | Literal["auto"] = Field(
         1, description="Passes over the scan; auto stops by itself, without ground truth."
     )
+    draws: int = Field(
+        1, ge=1, le=64, description="Random choices of what the network looks at, over which its answer is averaged."
+    )
     noise: float | None = Field(
         None, gt=0, allow_inf_nan=False, description="Standard deviation of the noise, in the scan's unit; estimated by default."
     )

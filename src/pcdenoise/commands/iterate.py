@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pcdenoise.commands import options, outputs
 from pcdenoise.commands.cleaning import chosen_model, named_model
 from pcdenoise.commands.console import Console, counted, figure, table
-from pcdenoise.commands.denoise import Iters, Method, Neighbours, Radius, SigmaD, SigmaN, Unshrink
+from pcdenoise.commands.denoise import Draws, Iters, Method, Neighbours, Radius, SigmaD, SigmaN, Unshrink
 from pcdenoise.commands.eval_chamfer import points_to_compare
 from pcdenoise.commands.files import format_of, refuse_existing, refuse_file, target_name
 from pcdenoise.commands.options import argument, configured, option
@@ -25,6 +25,7 @@ def iterate(
     model: options.Model = None,
     method: Method = "network",
     iters: Iters = "5",
+    draws: Draws = 1,
     noise: options.Noise = None,
     unshrink: Unshrink = None,
     neighbours: Neighbours = None,
@@ -52,8 +53,8 @@ def iterate(
     from pcdenoise.synthesis.meshes import load_mesh
 
     settings = configured(
-        DenoiseConfig, method=method, iters=iters, noise=noise, unshrink=unshrink, neighbours=neighbours, radius=radius,
-        sigma_d=sigma_d, sigma_n=sigma_n, seed=seed, threads=threads,
+        DenoiseConfig, method=method, iters=iters, draws=draws, noise=noise, unshrink=unshrink, neighbours=neighbours,
+        radius=radius, sigma_d=sigma_d, sigma_n=sigma_n, seed=seed, threads=threads,
     )  # fmt: skip
     strip, report = output / "passes.png", output / "report.html"
     refuse_file(output)

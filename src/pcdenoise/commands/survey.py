@@ -20,6 +20,7 @@ N_NEIGHBOURS = 16
 _COST = (31e-6, 2.0, 850, 0.1e9)
 """CPU seconds that one pass of the shipped model takes for a point and a run beside that, bytes of memory likewise: a line
 through `benchmarks/speed/measure.py --sizes 50K 800K`. To be set anew when the pass becomes faster."""
+_DRAW = 0.4  # of a pass: what one more draw of seeds takes
 _COST_IN_TORCH = (90e-6, 5.0, 950, 0.36e9)
 """The same where nothing was compiled."""
 
@@ -97,11 +98,12 @@ def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
     return found | {"warnings": said}
 
 
-def cost(n_points: int, n_passes: int = 1) -> dict[str, float]:
+def cost(n_points: int, n_passes: float = 1, n_draws: int = 1) -> dict[str, float]:
     """Processor seconds and bytes of memory that cleaning so many points takes, roughly: machines differ."""
     from pcdenoise.networks import fused
 
     cpu_s_per_point, start_cpu_s, bytes_per_point, start_bytes = _COST if fused.IS_BUILT else _COST_IN_TORCH
+    n_passes *= 1 + _DRAW * (n_draws - 1)
     return {
         "expected_cpu_s": start_cpu_s + cpu_s_per_point * n_points * n_passes,
         "expected_memory_mb": (start_bytes + bytes_per_point * n_points) / 1e6,

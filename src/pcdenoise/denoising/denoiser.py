@@ -36,6 +36,7 @@ _FURTHEST_STDS = 5.0
 """Longest move of one pass along the normal: what is further from the surface is no noise but an outlier or another thing."""
 _WORTHWHILE = 2e-3
 """`auto` goes on while a pass lowers the estimated error by this share; see docs/decisions/paper.md."""
+_DRAWS_APART = 1_000_003  # between the seeds of two draws, so that runs with seeds next to each other share none
 _NOTHING = 1e-6
 """Of the spacing: an error that falls by less is that of a cloud without noise."""
 
@@ -283,12 +284,13 @@ def one_pass(
     if model is None:
         raise UsageError("--method network needs a model; give --model, or choose --method jet")
     noise: float | NDArray[np.float64] = level.std
+    seeds = [config.seed + _DRAWS_APART * number for number in range(config.draws)]
     if isinstance(model.config.settings, ProjectionSettings):
-        moved, noise = network_pass.projection(points, identity, level, model, config.seed, threads, on_share)
+        moved, noise = network_pass.projection(points, identity, level, model, seeds, threads, on_share)
         moved = _unshrunk(points, moved, diagonal, config) if config.unshrink else moved
     else:
         unit = model.config.settings.unit or diagonal
-        moved = network_pass.mcconv(points, unit, model, config.seed, threads, on_share)
+        moved = np.mean([network_pass.mcconv(points, unit, model, seed, threads, on_share) for seed in seeds], axis=0)
         moved = moved if config.unshrink is False else _unshrunk(points, moved, unit, config)
     return relax(within(_FURTHEST_STDS * noise, points, moved), noise, config.relax_steps, threads)
 

@@ -6,7 +6,7 @@ Not here: what is done about a pass (denoiser.py), the networks (networks).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from threading import Lock
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pcdenoise.cloud.neighbours import Identity
 from pcdenoise.cloud.noise_level import NoiseLevel, by_place
 from pcdenoise.cloud.scan import Points
-from pcdenoise.denoising.seeds import coarsen, share_of_seeds, times_noisier
+from pcdenoise.denoising.seeds import Seeds, coarsen, share_of_seeds, times_noisier
 from pcdenoise.networks import fused
 from pcdenoise.networks.store import Model, ProjectionSettings
 
@@ -28,24 +28,48 @@ def projection(
     identity: Identity,
     level: NoiseLevel,
     model: Model,
-    seed: int,
+    seeds: Sequence[int],
     threads: int,
     on_share: Callable[[float], None],
 ) -> tuple[Points, NDArray[np.float64]]:
     """Coarse to fine in O(N·K): seeds find the surface, all points land on it, as far as there is one.
 
-    identity (N,): what seeds are drawn by. Gives the places and the noise (N,) that was found around each.
+    identity (N,): what seeds are drawn by, once for each of the numbers `seeds`. Gives the mean of where they lead and the noise
+    (N,) that was found around each point.
     """
     sizes = model.config.settings
     assert isinstance(sizes, ProjectionSettings)
     share = share_of_seeds(level, sizes.neighbours)
     noise = by_place(points, identity, level, threads)
+    noisier = None if level.is_known else times_noisier(noise, level, sizes.neighbours)
+    draws = seeds if share < 1 else seeds[:1]  # nothing is drawn where every point is its own seed
+    moved = np.zeros_like(points)
+    for number, seed in enumerate(draws):
+
+        def on_share_of_all(done: float, number: int = number) -> None:
+            on_share((number + done) / len(draws))
+
+        coarse = coarsen(points, share, seed, threads, identity, noisier) if share < 1 else None
+        moved += (_descended(points, coarse, noise, level, model, threads, on_share_of_all) - moved) / (number + 1)
+    return moved, noise
+
+
+def _descended(
+    points: Points,
+    coarse: Seeds | None,
+    noise: NDArray[np.float64],
+    level: NoiseLevel,
+    model: Model,
+    threads: int,
+    on_share: Callable[[float], None],
+) -> Points:
+    """(N, 3) where points land on these seeds, or where they lead each other if there are none."""
+    sizes = model.config.settings
+    assert isinstance(sizes, ProjectionSettings)
     seeds, count, cell, raw, seed_noise = points, None, np.arange(len(points)), None, noise
-    if share < 1:
-        noisier = None if level.is_known else times_noisier(noise, level, sizes.neighbours)
-        coarse = coarsen(points, share, seed, threads, identity, noisier)
+    if coarse is not None:
         seeds, count, cell, raw, seed_noise = coarse.points, coarse.count, coarse.cell, points, coarse.means(noise)
-    total = len(seeds) * sum(sizes.rounds) + (len(points) * sizes.landing_rounds if share < 1 else 0)
+    total = len(seeds) * sum(sizes.rounds) + (0 if raw is None else len(raw) * sizes.landing_rounds)
     done, counting = 0, Lock()
 
     def on_block(n: int) -> None:
@@ -60,7 +84,8 @@ def projection(
     else:
         moved, shape = _in_torch(model, seeds, count, raw, (seed_noise, noise), threads, on_block)
     explained = np.sqrt(seed_noise * level.std)  # half-way to the cloud's own: where foliage grows, places read much noise too
-    return points + trust(shape, explained)[cell, None] * (moved - points), noise
+    landed: Points = points + trust(shape, explained)[cell, None] * (moved - points)
+    return landed
 
 
 def trust(shape: NDArray[np.float32], noise: fused.Noise) -> NDArray[np.float64]:
