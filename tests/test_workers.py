@@ -94,6 +94,40 @@ def test_worker_processes_finish_though_one_is_killed(tiles: Path, plain: dict[s
     assert contents(tmp_path / "far") == plain
 
 
+_ONE_IDLE_ONE_AT_WORK = """
+import os, signal, time
+from pathlib import Path
+from pcdenoise.commands.files import Job
+from pcdenoise.commands.processes import in_processes
+
+HERE = Path(__file__).parent
+
+def work(job):
+    if job.source.name == "long" and not (HERE / "begun").exists():
+        (HERE / "begun").touch()
+        time.sleep(600)
+    return {"pid": os.getpid()}
+
+if __name__ == "__main__":
+    outcomes = in_processes(2)([Job(HERE / name, HERE / f"{name}.out") for name in ("short", "long")], work)
+    idle = next(outcomes).figures["pid"]
+    while not (HERE / "begun").exists():
+        time.sleep(0.01)
+    time.sleep(0.5)
+    os.kill(idle, signal.SIGKILL)
+    print([outcome.job.source.name for outcome in outcomes])
+"""
+
+
+def test_a_worker_that_is_killed_while_it_waits_holds_nobody_up(tmp_path: Path) -> None:
+    """It has the lock of the queue that jobs come by, which nobody gives back; the other is at work and must not wait for it."""
+    script = tmp_path / "script.py"
+    script.write_text(_ONE_IDLE_ONE_AT_WORK)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+    run = subprocess.run([sys.executable, str(script)], env=environment, capture_output=True, text=True, timeout=120)
+    assert run.stdout.strip() == "['long']", run.stderr
+
+
 def test_a_network_cleans_the_same_once_it_has_been_sent_to_a_worker(tiles: Path, tmp_path: Path) -> None:
     cleaned = {}
 

@@ -66,7 +66,7 @@ class NeighbourSearch:
     def __init__(self, points: Points, threads: int = -1) -> None:
         self.n_points = len(points)
         self.threads = threads
-        self._tree: _Compiled | _Tree = (_Compiled if IS_BUILT and 0 < len(points) < 2**31 else _Tree)(points)
+        self._tree: _OurTree | _SciPyTree = (_OurTree if IS_BUILT and 0 < len(points) < 2**31 else _SciPyTree)(points)
 
     def knn(self, queries: Points, k: int) -> tuple[Distances, Indices]:
         """(M, k) distances and row numbers of the nearest points, nearest first; k is cut to N. Needs N >= 1."""
@@ -86,8 +86,8 @@ class NeighbourSearch:
         each_block(lambda rows: self._tree.answer(queries, rows, indices, distances), len(queries), self.threads, _QUERIES)
 
 
-class _Tree:
-    """SciPy's."""
+class _SciPyTree:
+    """Gives equally near points in any order."""
 
     def __init__(self, points: Points) -> None:
         from scipy.spatial import cKDTree
@@ -102,8 +102,8 @@ class _Tree:
             distances[rows] = found[0]
 
 
-class _Compiled:
-    """Ours, which gives equally near points by row."""
+class _OurTree:
+    """Gives equally near points by row."""
 
     def __init__(self, points: Points) -> None:
         points = np.ascontiguousarray(points, np.float64)
@@ -113,7 +113,7 @@ class _Compiled:
         _neighbours.plant(address(points, np.float64), len(points), *self._parts)
 
     def answer(self, queries: Points, rows: slice, indices: NDArray[np.signedinteger], distances: Distances | None) -> None:
-        """The same."""
+        """As `_SciPyTree.answer`."""
         is_narrow = indices.dtype == np.int32
         narrow, wide = (address(indices, np.int32), 0) if is_narrow else (0, address(indices, np.int64))
         tree = *self._parts, len(self._rows)

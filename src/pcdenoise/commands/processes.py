@@ -30,16 +30,23 @@ def in_processes(n_workers: int) -> Engine:
             suspects: list[Job] = []
             with _pool(n_workers) as pool:
                 running: dict[Future[Outcome], Job] = {}
-                while (waiting or running) and not suspects:
-                    while waiting and len(running) < n_workers:
-                        job = waiting.popleft()
-                        running[pool.submit(far_outcome, work, job)] = job
+                is_broken = False
+                while (waiting or running) and not is_broken:
+                    try:
+                        while waiting and len(running) < n_workers:
+                            running[pool.submit(far_outcome, work, waiting[0])] = waiting[0]
+                            waiting.popleft()
+                    except BrokenProcessPool:  # by a worker that was waiting for this job
+                        is_broken = True
                     for future in wait(running, return_when=FIRST_COMPLETED).done:
                         job = running.pop(future)
                         if isinstance(future.exception(), BrokenProcessPool):
+                            is_broken = True
                             suspects.append(job)
                         else:
                             yield future.result()
+                if is_broken:
+                    _kill_others()
                 suspects += running.values()
             for job in suspects:
                 tidy(job.target)
@@ -56,6 +63,16 @@ def _alone(job: Job, work: Work) -> Outcome:
         tidy(job.target)
         fault = f"{job.source}: its worker was killed twice; it may need more memory: give fewer --workers or less --max-memory"
         return Outcome(job, error=ScanError(fault))
+
+
+def _kill_others() -> None:
+    """Ends the workers that are left of a broken pool, which asks them to end and waits until they have.
+
+    One at work takes that for the end of its job and goes on to the next; there it waits forever if the worker that was killed
+    had the lock of the queue. What it was at is tidied up by the parent, as what the killed one was at.
+    """
+    for process in active_children():
+        process.kill()
 
 
 class _pool(ProcessPoolExecutor):
