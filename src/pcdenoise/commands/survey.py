@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 N_NEIGHBOURS = 16
 """Nearest points whose disc gives the density."""
 
-_COST = (31e-6, 2.0, 850, 0.1e9)
+_COST = (33e-6, 0.8, 900, 0.06e9)
 """CPU seconds that one pass of the shipped model takes for a point and a run beside that, bytes of memory likewise: a line
 through `benchmarks/speed/measure.py --sizes 50K 800K`. To be set anew when the pass becomes faster."""
 _DRAW = 0.4  # of a pass: what one more draw of seeds takes
