@@ -30,7 +30,7 @@ _MANY_OUTLIERS = 1e-3
 _MOST_DEGREES = (180.0, 90.0)
 _LEAST_DEPTHS, _POINTS_PER_DEPTH, _DEPTHS_NEARBY = 8, 200, 2
 """Depths are rounded where there are so many at least, each of so many points on average, no more of them around most points."""
-_DEPTH_PROBES = 500
+_DEPTH_SAMPLE, _DEPTH_PROBES = 100_000, 500
 
 
 def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
@@ -165,7 +165,7 @@ def _rounding_std(step: float) -> float:
 
 
 def _rounded_depths(points: Points) -> dict[str, float]:
-    """Axes along which all points lie on few planes, as depth cameras measure, and the distance between planes at most points.
+    """Axes along which points lie on few planes, as depth cameras measure, and the distance between planes at most points.
 
     A regular grid lies on few planes as well, but a point of it has neighbours on several of them.
     """
@@ -174,14 +174,15 @@ def _rounded_depths(points: Points) -> dict[str, float]:
     from pcdenoise.cloud.neighbours import NeighbourSearch
 
     found: dict[str, float] = {}
-    for axis, values in zip("xyz", points.T, strict=True):
-        planes, plane = np.unique(values, return_inverse=True)
-        if not _LEAST_DEPTHS <= len(planes) <= len(points) / _POINTS_PER_DEPTH:
+    some = points[:: 1 + len(points) // _DEPTH_SAMPLE]
+    for axis in range(3):
+        planes, plane = np.unique(some[:, axis], return_inverse=True)
+        if not _LEAST_DEPTHS <= len(planes) <= len(some) / _POINTS_PER_DEPTH:
             continue
         probes = points[np.linspace(0, len(points) - 1, _DEPTH_PROBES).astype(int)]
-        near = np.sort(values[NeighbourSearch(points).knn(probes, N_NEIGHBOURS)[1]], axis=1)
+        near = np.sort(points[NeighbourSearch(points).knn(probes, N_NEIGHBOURS)[1], axis], axis=1)
         if np.median((np.diff(near, axis=1) > 0).sum(axis=1) + 1) <= _DEPTHS_NEARBY:
-            found[axis] = float(np.median(np.gradient(planes)[plane]))
+            found["xyz"[axis]] = float(np.median(np.gradient(planes)[plane]))
     return found
 
 
