@@ -2,7 +2,7 @@
 PYTHON ?= python3
 PIP := .venv/bin/python -m pip --disable-pip-version-check
 BIN := .venv/bin
-# pip does this for what it copies, but not for what it links to; without it every start of the program takes 0.2 CPU s more.
+# pip does this for what it copies, but not for what it links to; where Python may not do it either, a start takes 0.2 CPU s more.
 COMPILE := @$(BIN)/python -m compileall -q src
 COMPILED := $(wildcard src/pcdenoise/*/*.[ch])
 

@@ -57,6 +57,8 @@ CLOUDS = {
     "a sheet far away": lambda rng: rng.random((700, 3)) * [1, 1, 1e-3] + [5e5, 5e6, 100],
     "a line": lambda rng: rng.random((700, 1)) * [1.0, 2.0, 3.0],
     "a grid": lambda rng: rng.permutation(np.argwhere(np.ones((9, 9, 9))).astype(float))[:700],
+    "a grid whose steps are rounded": lambda rng: rng.permutation(np.argwhere(np.ones((9, 9, 9))) * 0.1)[:700],
+    "a sheet and a speck": lambda rng: np.concatenate([rng.random((400, 3)) * 1e-161, rng.random((300, 3)) * [1, 1, 1e-3]]),
     "one place": lambda rng: np.full((700, 3), 7.0),
     "a crowd and one far off": lambda rng: np.concatenate([1e-9 * rng.random((699, 3)), np.full((1, 3), 1e9)]),
 }
@@ -77,9 +79,12 @@ def test_neighbours_in_clouds_of_any_kind_are_those_of_brute_force(
     search = NeighbourSearch(points, threads=2)
     for k in (1, 2, 12, 33, 300, 700):
         distances, rows = search.knn(queries, k)
-        np.testing.assert_allclose(distances, np.sort(every, axis=1)[:, :k], rtol=1e-12)
-        np.testing.assert_allclose(distances, np.take_along_axis(every, rows, axis=1), rtol=1e-12)
+        np.testing.assert_allclose(distances, np.sort(every, axis=1)[:, :k], rtol=1e-12, atol=1e-155)
+        np.testing.assert_allclose(distances, np.take_along_axis(every, rows, axis=1), rtol=1e-12, atol=1e-155)
         assert (np.diff(np.sort(rows, axis=1), axis=1) > 0).all()
+        if is_built:  # whatever was asked before, and for whatever number
+            alone = [NeighbourSearch(points, 1).knn(queries[i : i + 1], 700)[1][0, :k] for i in range(0, len(queries), 40)]
+            np.testing.assert_array_equal(rows[::40], alone)
     if is_built and kind in ("a grid", "one place"):
         np.testing.assert_array_equal(search.knn(queries, 700)[1][:750], np.argsort(every[:750], axis=1, kind="stable"))
 

@@ -125,7 +125,7 @@ INLINE double to_box(const double *query, const double *box) {
         const double outside = larger64(larger64(box[a] - query[a], query[a] - box[a + 3]), 0);
         squared += outside * outside;
     }
-    return squared;
+    return squared * (1 - 1e-15); /* never more than that of a point in it, however either is rounded */
 }
 
 /* The k points nearest to a query by squared distance, nearest first; none is farther than the root of `bound`.
@@ -181,7 +181,7 @@ static ANY_PROCESSOR void nearest(const double *queries, Tree tree, int64_t star
         if (i > start) { /* as far as the last of the query before, and the way from there: near, where queries lie in order */
             double way[3] = {query[0] - query[-3], query[1] - query[-2], query[2] - query[-1]};
             const double reach = (sqrt(found[k - 1].key) + sqrt(dot(way, way))) * (1 + 1e-9);
-            if (reach >= 0) bound = reach * reach;
+            if (reach >= 0) bound = reach * reach + 1e-300; /* squares of tiny lengths are lost */
         }
         nearest_to(query, tree, k, bound, found, found + most, (int32_t *)(found + 2 * most));
         for (int64_t j = 0; j < k; j++) {

@@ -83,6 +83,8 @@ class NeighbourSearch:
 
     def _answer(self, queries: Points, indices: NDArray[np.signedinteger], distances: Distances | None) -> None:
         queries = np.ascontiguousarray(queries, np.float64)
+        if queries.ndim != 2 or queries.shape[1] != 3:
+            raise ValueError(f"queries must be (M, 3), got {queries.shape}")
         each_block(lambda rows: self._tree.answer(queries, rows, indices, distances), len(queries), self.threads, _QUERIES)
 
 

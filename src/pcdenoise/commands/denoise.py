@@ -38,7 +38,12 @@ Unshrink = Annotated[
 Iters = Annotated[str, option("--iters", metavar="N|auto", help="Passes; auto stops when the next would not help.")]
 Draws = Annotated[
     int,
-    option("--draws", min=1, max=64, help="Mean over so many random choices: less error for more time; 4 is a good number."),
+    option(
+        "--draws",
+        min=1,
+        max=64,
+        help="Mean over so many random choices: where there is much noise, less error for more time, 4 for twice.",
+    ),
 ]
 
 _UNTOLD = Path("?")
@@ -174,6 +179,7 @@ def _plan_text(records: list[dict[str, Any]], done: list[Job], settings: Denoise
     from pcdenoise.commands.survey import cost, cost_text
 
     rows, warnings = [], []
+    draws = settings.draws if settings.method == "network" else 1
     for record in records:
         if record["status"] == "failed":
             rows.append([record["input"], *[""] * 5, record["output"], record["error"].removeprefix(f"{record['input']}: ")])
@@ -186,7 +192,7 @@ def _plan_text(records: list[dict[str, Any]], done: list[Job], settings: Denoise
                 figure(found.get("spacing", 0.0)),
                 figure(settings.noise or found["noise"]) if found.get("is_surface") else "no surface",
                 str(settings.iters),
-                cost_text(cost(found["points"], 3 if settings.iters == "auto" else settings.iters, settings.draws)),
+                cost_text(cost(found["points"], 3 if settings.iters == "auto" else settings.iters, draws)),
                 record["output"],
                 "ready",
             ]

@@ -28,8 +28,9 @@ _MOST_JUDGED = 200_000  # points of which outliers are counted
 _BLOCKS = 4  # compact parts of the cloud that they are taken from
 _MANY_OUTLIERS = 1e-3
 _MOST_DEGREES = (180.0, 90.0)
-_LEAST_DEPTHS, _POINTS_PER_DEPTH, _DEPTHS_NEARBY = 8, 200, 2
-"""Depths are rounded where there are so many at least, each of so many points on average, no more of them around most points."""
+_LEAST_DEPTHS, _POINTS_PER_DEPTH, _DEPTHS_NEARBY, _WIDTH = 32, 200, 2, 0.2
+"""Depths are rounded where there are so many at least, each of so many points on average, no more of them around most points, and
+those points so wide for their length: the floors and stairs of a drawing are fewer planes, the rows of a scanner are lines."""
 _DEPTH_SAMPLE, _DEPTH_PROBES = 100_000, 500
 
 
@@ -149,41 +150,44 @@ def traps(scan: Scan, noise: float | None) -> list[str]:
         return said
     if (step := io.coordinate_step(scan)) and noise < step:
         said.append(f"the noise is below the file's step of {step:g}, and moves below half of it vanish; write .ply to keep them")
-    rounded = {axis: step for axis, step in _rounded_depths(points).items() if noise < _rounding_std(step) / 2}
-    for axis, step in rounded.items():
-        fix = f"--noise {_rounding_std(step):.2g} tells how far off they are"
-        said.append(f"{axis} was rounded, in steps of {step:.2g} at most points, so that neighbours show no noise; {fix}")
+    rounded = _rounded_depths(points, noise)
+    for axis, std in rounded.items():
+        fix = f"--noise {std:.2g} tells how far off they are"
+        said.append(
+            f"{axis} was rounded, in steps of {std * math.sqrt(12):.2g} at most points, so that neighbours show no noise; {fix}"
+        )
     if (step := _float32_step(points)) > noise / 4 and not rounded:
         fix = "export from the source in float64, or with an offset"
         said.append(f"coordinates were rounded to float32, in steps of {step:g} so far from the origin; {fix}")
     return said
 
 
-def _rounding_std(step: float) -> float:
-    """Of what is rounded to multiples of a step."""
-    return step / math.sqrt(12)
+def _rounded_depths(points: Points, noise: float) -> dict[str, float]:
+    """Axes along which points lie on few planes, as depth cameras measure, and the standard deviation of that, unless it shows.
 
-
-def _rounded_depths(points: Points) -> dict[str, float]:
-    """Axes along which points lie on few planes, as depth cameras measure, and the distance between planes at most points.
-
-    A regular grid lies on few planes as well, but a point of it has neighbours on several of them.
+    Around most points the nearest others lie on one or two planes, and all over them. Rows of a grid or of a line scanner are
+    planes as well, but then the nearest others lie on several of them, or along a line.
     """
     import numpy as np
 
     from pcdenoise.cloud.neighbours import NeighbourSearch
 
-    found: dict[str, float] = {}
     some = points[:: 1 + len(points) // _DEPTH_SAMPLE]
+    found: dict[str, float] = {}
     for axis in range(3):
         planes, plane = np.unique(some[:, axis], return_inverse=True)
-        if not _LEAST_DEPTHS <= len(planes) <= len(some) / _POINTS_PER_DEPTH:
-            continue
-        probes = points[np.linspace(0, len(points) - 1, _DEPTH_PROBES).astype(int)]
-        near = np.sort(points[NeighbourSearch(points).knn(probes, N_NEIGHBOURS)[1], axis], axis=1)
-        if np.median((np.diff(near, axis=1) > 0).sum(axis=1) + 1) <= _DEPTHS_NEARBY:
-            found["xyz"[axis]] = float(np.median(np.gradient(planes)[plane]))
-    return found
+        if _LEAST_DEPTHS <= len(planes) <= len(some) / _POINTS_PER_DEPTH:
+            found["xyz"[axis]] = float(np.median(np.gradient(planes)[plane])) / math.sqrt(12)
+    found = {axis: std for axis, std in found.items() if noise < std / 2}
+    if not found:
+        return found
+    probes = points[np.linspace(0, len(points) - 1, _DEPTH_PROBES).astype(int)]
+    near = points[NeighbourSearch(points).knn(probes, N_NEIGHBOURS)[1]]
+    n_planes = np.median((np.diff(np.sort(near, axis=1), axis=1) > 0).sum(axis=1) + 1, axis=0)
+    near = near - near.mean(axis=1, keepdims=True)
+    squared = np.linalg.eigvalsh(near.transpose(0, 2, 1) @ near)
+    is_flat = np.median(squared[:, 1] / np.maximum(squared[:, 2], 1e-300)) > _WIDTH**2
+    return {axis: std for axis, std in found.items() if is_flat and n_planes["xyz".index(axis)] <= _DEPTHS_NEARBY}
 
 
 def _misfit(system: Crs, points: Points) -> str:

@@ -284,13 +284,13 @@ def one_pass(
     if model is None:
         raise UsageError("--method network needs a model; give --model, or choose --method jet")
     noise: float | NDArray[np.float64] = level.std
-    seeds = [config.seed + _DRAWS_APART * number for number in range(config.draws)]
+    seeds = [(config.seed + _DRAWS_APART * number) % 2**64 for number in range(config.draws)]
     if isinstance(model.config.settings, ProjectionSettings):
         moved, noise = network_pass.projection(points, identity, level, model, seeds, threads, on_share)
         moved = _unshrunk(points, moved, diagonal, config) if config.unshrink else moved
     else:
         unit = model.config.settings.unit or diagonal
-        moved = np.mean([network_pass.mcconv(points, unit, model, seed, threads, on_share) for seed in seeds], axis=0)
+        moved = network_pass.mcconv(points, unit, model, seeds, threads, on_share)
         moved = moved if config.unshrink is False else _unshrunk(points, moved, unit, config)
     return relax(within(_FURTHEST_STDS * noise, points, moved), noise, config.relax_steps, threads)
 

@@ -20,6 +20,9 @@ from pcdenoise.denoising.seeds import Seeds, coarsen, share_of_seeds, times_nois
 from pcdenoise.networks import fused
 from pcdenoise.networks.store import Model, ProjectionSettings
 
+OnShare = Callable[[float], None]
+"""Called with the share of a pass that is done, 0 to 1."""
+
 _DECODED_AT_ONCE = 65_536
 
 
@@ -30,7 +33,7 @@ def projection(
     model: Model,
     seeds: Sequence[int],
     threads: int,
-    on_share: Callable[[float], None],
+    on_share: OnShare,
 ) -> tuple[Points, NDArray[np.float64]]:
     """Coarse to fine in O(N·K): seeds find the surface, all points land on it, as far as there is one.
 
@@ -42,16 +45,25 @@ def projection(
     share = share_of_seeds(level, sizes.neighbours)
     noise = by_place(points, identity, level, threads)
     noisier = None if level.is_known else times_noisier(noise, level, sizes.neighbours)
-    draws = seeds if share < 1 else seeds[:1]  # nothing is drawn where every point is its own seed
-    moved = np.zeros_like(points)
-    for number, seed in enumerate(draws):
+
+    def moved(seed: int, on_share: OnShare) -> Points:
+        coarse = coarsen(points, share, seed, threads, identity, noisier) if share < 1 else None
+        return _descended(points, coarse, noise, level, model, threads, on_share)
+
+    return _mean(moved, seeds if share < 1 else seeds[:1], on_share), noise  # where every point is its own seed none are drawn
+
+
+def _mean(moved: Callable[[int, OnShare], Points], seeds: Sequence[int], on_share: OnShare) -> Points:
+    """(N, 3) mean of where each of these seeds leads, two results in memory at a time."""
+    mean: Points | float = 0.0
+    for number, seed in enumerate(seeds):
 
         def on_share_of_all(done: float, number: int = number) -> None:
-            on_share((number + done) / len(draws))
+            on_share((number + done) / len(seeds))
 
-        coarse = coarsen(points, share, seed, threads, identity, noisier) if share < 1 else None
-        moved += (_descended(points, coarse, noise, level, model, threads, on_share_of_all) - moved) / (number + 1)
-    return moved, noise
+        mean = mean + (moved(seed, on_share_of_all) - mean) / (number + 1)
+    assert not isinstance(mean, float)
+    return mean
 
 
 def _descended(
@@ -61,7 +73,7 @@ def _descended(
     level: NoiseLevel,
     model: Model,
     threads: int,
-    on_share: Callable[[float], None],
+    on_share: OnShare,
 ) -> Points:
     """(N, 3) where points land on these seeds, or where they lead each other if there are none."""
     sizes = model.config.settings
@@ -122,11 +134,16 @@ def _in_torch(
     return landed.numpy(), descent.shape.numpy()
 
 
-def mcconv(points: Points, unit: float, model: Model, seed: int, threads: int, on_share: Callable[[float], None]) -> Points:
-    """In the network's frame. Only the first level, which is small, is looked at as a whole; the points follow in blocks.
+def mcconv(points: Points, unit: float, model: Model, seeds: Sequence[int], threads: int, on_share: OnShare) -> Points:
+    """In the network's frame, the mean over the seeds that its samples are drawn by.
 
     unit: what the network takes for one, in the points' unit.
     """
+    return _mean(lambda seed, on_share: _sampled(points, unit, model, seed, threads, on_share), seeds, on_share)
+
+
+def _sampled(points: Points, unit: float, model: Model, seed: int, threads: int, on_share: OnShare) -> Points:
+    """Only the first level, which is small, is looked at as a whole; the points follow in blocks."""
     import torch
 
     from pcdenoise.networks.mcconv import MCConvNetwork
