@@ -42,7 +42,7 @@ Draws = Annotated[
         "--draws",
         min=1,
         max=64,
-        help="Mean over so many random choices: where there is much noise, less error for more time, 4 for twice.",
+        help="Mean over so many random choices: less error where there is much noise; 4 take twice the time.",
     ),
 ]
 

@@ -20,9 +20,9 @@ N_NEIGHBOURS = 16
 _COST = (33e-6, 0.8, 900, 0.06e9)
 """CPU seconds that one pass of the shipped model takes for a point and a run beside that, bytes of memory likewise: a line
 through `benchmarks/speed/measure.py --sizes 50K 800K`. To be set anew when the pass becomes faster."""
-_DRAW = 0.4  # of a pass: what one more draw of seeds takes
 _COST_IN_TORCH = (90e-6, 5.0, 950, 0.36e9)
 """The same where nothing was compiled."""
+_DRAW = 0.4  # of a pass: what one more draw of seeds takes
 
 _MOST_JUDGED = 200_000  # points of which outliers are counted
 _BLOCKS = 4  # compact parts of the cloud that they are taken from
@@ -170,24 +170,24 @@ def _rounded_depths(points: Points, noise: float) -> dict[str, float]:
     """
     import numpy as np
 
-    from pcdenoise.cloud.neighbours import NeighbourSearch
+    from pcdenoise.cloud.neighbours import knn
 
     some = points[:: 1 + len(points) // _DEPTH_SAMPLE]
-    found: dict[str, float] = {}
+    stds: dict[int, float] = {}
     for axis in range(3):
         planes, plane = np.unique(some[:, axis], return_inverse=True)
         if _LEAST_DEPTHS <= len(planes) <= len(some) / _POINTS_PER_DEPTH:
-            found["xyz"[axis]] = float(np.median(np.gradient(planes)[plane])) / math.sqrt(12)
-    found = {axis: std for axis, std in found.items() if noise < std / 2}
-    if not found:
-        return found
+            std = float(np.median(np.gradient(planes)[plane])) / math.sqrt(12)
+            stds |= {axis: std} if noise < std / 2 else {}
+    if not stds:
+        return {}
     probes = points[np.linspace(0, len(points) - 1, _DEPTH_PROBES).astype(int)]
-    near = points[NeighbourSearch(points).knn(probes, N_NEIGHBOURS)[1]]
+    near = points[knn(points, N_NEIGHBOURS, probes)[1]]
     n_planes = np.median((np.diff(np.sort(near, axis=1), axis=1) > 0).sum(axis=1) + 1, axis=0)
     near = near - near.mean(axis=1, keepdims=True)
     squared = np.linalg.eigvalsh(near.transpose(0, 2, 1) @ near)
     is_flat = np.median(squared[:, 1] / np.maximum(squared[:, 2], 1e-300)) > _WIDTH**2
-    return {axis: std for axis, std in found.items() if is_flat and n_planes["xyz".index(axis)] <= _DEPTHS_NEARBY}
+    return {"xyz"[axis]: std for axis, std in stds.items() if is_flat and n_planes[axis] <= _DEPTHS_NEARBY}
 
 
 def _misfit(system: Crs, points: Points) -> str:

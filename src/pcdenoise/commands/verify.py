@@ -11,7 +11,7 @@ import typer
 from pcdenoise.commands import options
 from pcdenoise.commands.console import figure, table
 from pcdenoise.commands.files import format_of
-from pcdenoise.commands.options import option
+from pcdenoise.commands.options import configured, option
 from pcdenoise.errors import GateError
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def verify(
     from pcdenoise import io
     from pcdenoise.config import DenoiseConfig
 
-    noise = options.configured(DenoiseConfig, noise=noise).noise
+    noise = configured(DenoiseConfig, noise=noise).noise
     cleaned = io.read(after, format=format_of(after, format))
     findings = compare(io.read(before, format=format_of(before, format)), cleaned, noise)
     print(json.dumps(findings, indent=2) if as_json else _as_text(findings))

@@ -36,9 +36,9 @@ _FURTHEST_STDS = 5.0
 """Longest move of one pass along the normal: what is further from the surface is no noise but an outlier or another thing."""
 _WORTHWHILE = 2e-3
 """`auto` goes on while a pass lowers the estimated error by this share; see docs/decisions/paper.md."""
-_DRAWS_APART = 1_000_003  # between the seeds of two draws, so that runs with seeds next to each other share none
 _NOTHING = 1e-6
 """Of the spacing: an error that falls by less is that of a cloud without noise."""
+_DRAWS_APART = 1_000_003  # between the seeds of two draws, so that runs with seeds next to each other share none
 
 Progress = Callable[[str, float], None]
 """Called with what is being done and the share of it that is done, 0 to 1."""

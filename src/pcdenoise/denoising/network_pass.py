@@ -55,14 +55,13 @@ def projection(
 
 def _mean(moved: Callable[[int, OnShare], Points], seeds: Sequence[int], on_share: OnShare) -> Points:
     """(N, 3) mean of where each of these seeds leads, two results in memory at a time."""
-    mean: Points | float = 0.0
+    mean: Points = np.zeros((1, 3))
     for number, seed in enumerate(seeds):
 
         def on_share_of_all(done: float, number: int = number) -> None:
             on_share((number + done) / len(seeds))
 
         mean = mean + (moved(seed, on_share_of_all) - mean) / (number + 1)
-    assert not isinstance(mean, float)
     return mean
 
 
