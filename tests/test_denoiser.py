@@ -27,7 +27,7 @@ from pcdenoise.errors import ModelError, UsageError
 from pcdenoise.networks import fused, store
 from pcdenoise.networks.projection import ProjectionConfig, ProjectionNetwork
 from pcdenoise.networks.store import Model
-from pcdenoise.synthesis.noise import beam_bias
+from pcdenoise.synthesis.noise import Noise, along_rays, beam_bias, heavy_tailed
 
 PLAIN = DenoiseConfig(threads=1)
 
@@ -90,7 +90,35 @@ def test_noise_that_grows_along_a_scan_is_removed_better_than_by_one_number(
     noisy, _ = varied(sample, 0.5, 4.0)
     by_place = denoise(noisy, shipped, PLAIN).points
     monkeypatch.setattr(network_pass, "by_place", lambda points, _identity, level, _threads: np.full(len(points), level.std))
-    assert sample.error(by_place) < 0.97 * sample.error(denoise(noisy, shipped, PLAIN).points)
+    assert sample.error(by_place) < 0.98 * sample.error(denoise(noisy, shipped, PLAIN).points)
+
+
+@pytest.mark.parametrize("law", [heavy_tailed, along_rays])
+def test_noise_that_neighbours_show_too_little_of_is_read_by_what_is_taken_off(
+    shipped: Model, law: Noise, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    surface = cloud("torus", 12_000, 0.0)
+    std = 1.2 * surface.spacing
+    noisy = law(surface.clean, std, np.random.default_rng(2))
+    once_more = denoise(noisy, shipped, PLAIN)
+    monkeypatch.setattr(denoiser.taken_off, "level_by", lambda read, *_given: read)
+    as_read = denoise(noisy, shipped, PLAIN)
+    true = surface.error(noisy)
+    assert as_read.figures["noise"] < 0.85 * true
+    assert 1.1 * as_read.figures["noise"] < once_more.figures["noise"] < 1.1 * true
+    assert surface.error(once_more.points) < 0.95 * surface.error(as_read.points)
+
+
+@pytest.mark.parametrize("name", ["plane", "sphere", "torus", "cube"])
+def test_gaussian_noise_is_read_once(shipped: Model, name: str) -> None:
+    """Neighbours show it: what is taken off is within the reading's own scatter and what edges add."""
+    sample = cloud(name, 12_000, 1.2)
+    assert level_of(sample.noisy, shipped, PLAIN).std == pytest.approx(estimate(sample.noisy, threads=1).std, rel=0.03)
+
+
+def test_noise_that_is_told_stays_as_it_is_told(shipped: Model) -> None:
+    noisy = heavy_tailed(cloud("torus", 4000, 0.0).clean, 0.08, np.random.default_rng(2))
+    assert level_of(noisy, shipped, PLAIN.model_copy(update={"noise": 0.05})).std == 0.05
 
 
 def test_telling_the_noise_that_would_have_been_read_is_as_good_where_all_places_have_it(shipped: Model, coarse: Cloud) -> None:
@@ -134,7 +162,7 @@ def test_a_real_scan_becomes_smooth_and_keeps_its_extent(shipped: Model, milk: P
     points = io.read(milk).points
     result = denoise(points, shipped, PLAIN)
     noise = estimate(points, threads=1).std
-    assert result.figures["noise"] == pytest.approx(noise, rel=0.05)
+    assert 0.95 < result.figures["noise"] / noise < 1.5  # by what is taken off, which is more than neighbours show
     assert estimate(result.points, threads=1).std < 0.5 * noise
     for side in (np.min, np.max):
         assert np.abs(side(result.points, axis=0) - side(points, axis=0)).max() < 4 * noise
@@ -308,7 +336,7 @@ def test_any_small_cloud_comes_back_with_its_rows_and_finite_where_it_was(points
 
 def test_draws_are_averaged_over_seeds_of_their_own_and_what_is_left_is_less(coarse: Cloud) -> None:
     """The mean of as many runs under one level; where every point is its own seed nothing is drawn."""
-    level = level_of(coarse.noisy, PLAIN)
+    level = level_of(coarse.noisy, model("seeded"), PLAIN)
 
     def moved(cloud: Cloud, level: NoiseLevel, **settings: int) -> np.ndarray:
         return denoise(cloud.noisy, model("seeded"), PLAIN.model_copy(update={"relax_steps": 0, **settings}), level=level).points
@@ -319,7 +347,7 @@ def test_draws_are_averaged_over_seeds_of_their_own_and_what_is_left_is_less(coa
     np.testing.assert_allclose(together, np.mean(single, axis=0), atol=1e-12)
     assert coarse.error(together) < min(coarse.error(points) for points in single)
     fine = cloud("sphere", 2000, 0.2)
-    level = level_of(fine.noisy, PLAIN)
+    level = level_of(fine.noisy, model("seeded"), PLAIN)
     np.testing.assert_array_equal(moved(fine, level, draws=3), moved(fine, level))
 
 
@@ -544,7 +572,7 @@ def test_the_network_needs_a_model_and_a_model_needs_numbers(fine: Cloud) -> Non
 
 def test_the_noise_that_is_reported_is_the_noise_that_is_cleaned_by(coarse: Cloud) -> None:
     repeated = np.concatenate([coarse.noisy, coarse.noisy[:10], np.full((1, 3), np.nan)])
-    reported, used = estimate(repeated[:-1]), level_of(repeated, PLAIN)
+    reported, used = estimate(repeated[:-1]), level_of(repeated, None, PLAIN)
     assert (used.std, used.spacing) == pytest.approx((reported.std, reported.spacing), rel=1e-9)
 
 
@@ -553,7 +581,7 @@ def test_without_compiled_code_scipy_torch_and_numpy_clean_alike(
 ) -> None:
     for module in (neighbours, fused, relaxation):
         monkeypatch.setattr(module, "IS_BUILT", False)
-    np.testing.assert_allclose(clean(coarse.noisy).points, coarse_result.points, atol=3e-5 * coarse.spacing)
+    np.testing.assert_allclose(clean(coarse.noisy).points, coarse_result.points, atol=5e-5 * coarse.spacing)
 
 
 def test_networks_of_sizes_that_nothing_is_compiled_for_clean_too() -> None:

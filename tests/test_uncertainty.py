@@ -50,7 +50,7 @@ def test_where_there_was_more_noise_more_uncertainty_is_left() -> None:
     result = denoise(noisy, store.load(), ASKED)
     distance = np.abs(sample.surface.signed_distance(result.points))
     quiet, loud = times < 0.9, times > 1.4
-    assert result.std[loud].mean() > 1.5 * result.std[quiet].mean()
+    assert result.std[loud].mean() > 1.35 * result.std[quiet].mean()
     for place in (quiet, loud):  # three times 0.053, as above, and two more for what places are not told apart by (0.43 to 0.77)
         assert (distance[place] < result.std[place]).mean() == pytest.approx(0.683, abs=5 * 0.053)
 

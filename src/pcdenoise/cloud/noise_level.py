@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -58,7 +58,8 @@ class NoiseLevel:
 
     scale_points: how many nearest points show a surface rather than a ball of noise; it grows as std² times density.
     is_surface: whether any scale shows one (False: vegetation, clutter, a filled volume).
-    is_known: whether somebody told the std. n_points: distinct points of the cloud that it was read from.
+    is_known: whether somebody told the std. n_points: distinct points of the cloud that it was read from. times_read: how many
+    times what neighbours disagree by the std is, where something else says so.
     """
 
     std: float
@@ -67,6 +68,22 @@ class NoiseLevel:
     is_surface: bool
     is_known: bool = False
     n_points: int = 0
+    times_read: float = 1.0
+
+    def times(self, factor: float) -> NoiseLevel:
+        """The level of so many times the noise; the scale goes with its square, as the points of a disc do."""
+        std, scale_points, times_read = factor * self.std, factor**2 * self.scale_points, factor * self.times_read
+        return replace(self, std=std, scale_points=scale_points, times_read=times_read)
+
+    @property
+    def is_noise(self) -> float:
+        """How far what a place shows is noise: 0 where the smallest neighbourhood is much larger than the noise, to 1."""
+        return float(np.clip((self.scale_points - _PLACES_FROM) / (_PLACES_IN_FULL - _PLACES_FROM), 0, 1))
+
+    @property
+    def as_read(self) -> NoiseLevel:
+        """The level by what neighbours disagree by alone."""
+        return self.times(1 / self.times_read)
 
 
 def estimate(points: Points, seed: int = 0, threads: int = -1, known_std: float | None = None) -> NoiseLevel:
@@ -154,8 +171,9 @@ def by_place(points: Points, identity: Identity, level: NoiseLevel, threads: int
     Noise that is known, and that of places without a surface, is the level's. Places are drawn by identity (N,), and what is read
     there and spread from there lies near, so that a part of a cloud gives what the whole does.
     """
-    everywhere = np.full(len(points), level.std)
-    share = float(np.clip((level.scale_points - _PLACES_FROM) / (_PLACES_IN_FULL - _PLACES_FROM), 0, 1))
+    if level.times_read != 1:
+        return level.times_read * by_place(points, identity, level.as_read, threads)
+    everywhere, share = np.full(len(points), level.std), level.is_noise
     if level.is_known or level.std <= 0 or share == 0:
         return everywhere
     places, std = _readings(points, drawn_by(identity, _PLACES_SEED), level, threads)

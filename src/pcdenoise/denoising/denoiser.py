@@ -19,7 +19,7 @@ from pcdenoise.cloud.neighbours import Identity, coordinate_hash, distinct_by, d
 from pcdenoise.cloud.noise_level import NoiseLevel, by_place, estimate_at, probes
 from pcdenoise.cloud.scan import Mask, Points, check_extent, within
 from pcdenoise.config import DenoiseConfig
-from pcdenoise.denoising import classical, network_pass, outliers, uncertainty
+from pcdenoise.denoising import classical, network_pass, outliers, taken_off, uncertainty
 from pcdenoise.denoising.relaxation import relax, without_low_frequencies
 from pcdenoise.denoising.risk import Risk
 from pcdenoise.errors import UsageError
@@ -32,8 +32,6 @@ N_CENTRAL = 1 << 16
 _MOST_PASSES = 10
 _SHRINKING = 0.035
 """Radius over which moves that all points share are taken back, in the network's units of length; as released."""
-_FURTHEST_STDS = 5.0
-"""Longest move of one pass along the normal: what is further from the surface is no noise but an outlier or another thing."""
 _WORTHWHILE = 2e-3
 """`auto` goes on while a pass lowers the estimated error by this share; see docs/decisions/paper.md."""
 _NOTHING = 1e-6
@@ -85,10 +83,10 @@ def denoise(
     Rows that are not finite stay as they are; exact duplicates move together; the network leaves a cloud in which no scale
     shows a surface as it is. Raises UsageError when the network is asked for without a model.
     """
-    cloud = _Cloud(points, config, level)
+    cloud = _Cloud(points, model, config, level)
     found = np.zeros(len(points), dtype=bool)
     if config.outliers != "keep" and len(cloud.start) >= FEWEST_POINTS:
-        found = cloud.to_rows(outliers.find(cloud.start, level=cloud.level, threads=cloud.threads), False)
+        found = cloud.to_rows(outliers.find(cloud.start, level=cloud.level.as_read, threads=cloud.threads), False)
     steps = list(_passes(cloud, model, config, on_progress or (lambda _task, _share: None)))
     moved = steps[-1].points if steps else cloud.start
     unmoved = cloud.unmoved(moved)
@@ -114,7 +112,7 @@ def denoise(
     if config.uncertainty:
         off = np.full(len(moved), np.nan)
         if cloud.level.is_surface:
-            noise = by_place(cloud.start, cloud.identity, cloud.level, cloud.threads)
+            noise = by_place(cloud.start, cloud.identity, cloud.level.as_read, cloud.threads)
             cleaned = cloud.reached[spatial_order(cloud.reached)]
             off = uncertainty.estimate(cleaned, cloud.start, cloud.reached, moved, noise, cloud.threads)
         std = cloud.to_rows(off, np.nan)
@@ -122,14 +120,14 @@ def denoise(
     return Result(placed[-1].points if placed else points.copy(), found, unmoved, figures, placed, std)
 
 
-def level_of(points: Points, config: DenoiseConfig) -> NoiseLevel:
+def level_of(points: Points, model: Model | None, config: DenoiseConfig) -> NoiseLevel:
     """The noise level by which `denoise` would clean (N, 3) points."""
-    return _Cloud(points, config).level
+    return _Cloud(points, model, config).level
 
 
 def iterate(points: Points, model: Model | None, config: DenoiseConfig) -> Iterator[Step]:
     """Pass after pass, each fed with the last one's output: (N, 3) points and figures of every step."""
-    cloud = _Cloud(points, config)
+    cloud = _Cloud(points, model, config)
     for step in _passes(cloud, model, config, lambda _task, _share: None, is_judged=True):
         yield Step(cloud.placed(step.points), step.figures)
 
@@ -140,7 +138,7 @@ class _Cloud:
     reached (D, 3): where the passes so far led them, before strength and limit.
     """
 
-    def __init__(self, points: Points, config: DenoiseConfig, level: NoiseLevel | None = None) -> None:
+    def __init__(self, points: Points, model: Model | None, config: DenoiseConfig, level: NoiseLevel | None = None) -> None:
         self.config, self.rows = config, points
         self.threads = config.threads or os.cpu_count() or 1
         self.finite: Mask = np.logical_and.reduce(np.isfinite(points), axis=1)
@@ -157,8 +155,22 @@ class _Cloud:
         self.identity: Identity = identity[first][order]
         self._row = back[place]
         self.probes = probes(drawn_by(self.identity, config.seed))
-        self.level: NoiseLevel = level or estimate_at(self.start, self.probes, self.threads, config.noise)
+        self.level: NoiseLevel = level or self._level(model)
         self.diagonal = float(np.linalg.norm(np.ptp(self.start, axis=0))) if len(self.start) else 0.0
+
+    def _level(self, model: Model | None) -> NoiseLevel:
+        """The noise as neighbours disagree by it, then as a pass takes it off some of the points."""
+        read = estimate_at(self.start, self.probes, self.threads, self.config.noise)
+        first = np.argsort(drawn_by(self.identity[self.probes], self.config.seed))[: taken_off.N_SAMPLES]
+        centres = self.start[self.probes[first]]
+        return taken_off.level_by(read, centres, self._around, model, self.config, self.threads)
+
+    def _around(self, centre: Points, most: int) -> taken_off.Sample:
+        if most >= len(self.start):
+            return self.start, self.identity
+        distance = ((self.start - centre) ** 2).sum(axis=1)
+        rows = np.sort(np.argpartition(distance, most)[:most])
+        return self.start[rows], self.identity[rows]
 
     def to_rows(self, values: NDArray[Any], missing: Any) -> NDArray[Any]:
         """Values of the distinct points (D, …) spread to all rows (N, …); positions get their origin back."""
@@ -237,7 +249,7 @@ def _passes(
     points, level, judge = cloud.start, cloud.level, None
     n_passes = most_passes(len(points), level, config)
     if n_passes and (config.iters == "auto" or is_judged):
-        risk = Risk(points, cloud.identity, level, config.seed, cloud.threads)
+        risk = Risk(points, cloud.identity, level.as_read, config.seed, cloud.threads)
         judge = Judge(risk, level, cloud.diagonal, model, config, cloud.threads)
     for number in range(1, n_passes + 1):
         task = "cleaning" if config.iters == 1 else f"pass {number}"
@@ -292,7 +304,7 @@ def one_pass(
         unit = model.config.settings.unit or diagonal
         moved = network_pass.mcconv(points, unit, model, seeds, threads, on_share)
         moved = moved if config.unshrink is False else _unshrunk(points, moved, unit, config)
-    return relax(within(_FURTHEST_STDS * noise, points, moved), noise, config.relax_steps, threads)
+    return relax(within(taken_off.FURTHEST_STDS * noise, points, moved), noise, config.relax_steps, threads)
 
 
 def _filtered(points: Points, level: NoiseLevel, diagonal: float, config: DenoiseConfig, threads: int) -> Points:

@@ -31,7 +31,7 @@ def denoise_part(
     """
     usable = np.logical_and.reduce(np.isfinite(points), axis=1)
     movable = movable & seen
-    level = level_of(points[seen], config)
+    level = level_of(points[seen], model, config)
     worked = seen & usable
     if (movable & usable).any():
         passes = 10 if config.iters == "auto" else config.iters

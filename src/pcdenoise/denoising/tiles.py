@@ -36,7 +36,7 @@ from pcdenoise.cloud.neighbours import Distances, Identity, NeighbourSearch, coo
 from pcdenoise.cloud.noise_level import N_PROBES, NoiseLevel, by_place, estimate_from
 from pcdenoise.cloud.scan import Mask, Points, check_extent
 from pcdenoise.config import DenoiseConfig
-from pcdenoise.denoising import classical, denoiser, outliers, risk, uncertainty
+from pcdenoise.denoising import classical, denoiser, outliers, risk, taken_off, uncertainty
 from pcdenoise.denoising.denoiser import Progress
 from pcdenoise.denoising.seeds import share_of_seeds
 from pcdenoise.networks.store import Model
@@ -194,7 +194,7 @@ class Tiles:
         n_done = 0
         if self.config.outliers != "keep":
             for cell in self.cells:
-                self.find_outliers(cell, first)
+                self.find_outliers(cell, first.as_read)
                 on_progress("outliers", (cell + 1) / len(self.cells))
         most = denoiser.most_passes(self.plan["n_distinct"], first, self.config)
         judge = self._judge(first) if most and self.config.iters == "auto" else None
@@ -214,7 +214,7 @@ class Tiles:
             level, n_done = after, number
         if self.config.uncertainty:
             for cell in self.cells:
-                self.find_uncertainty(cell, n_done, first)
+                self.find_uncertainty(cell, n_done, first.as_read)
         drifts = [self._drift(cell, n_done) for cell in self.cells]
         share = np.array([n for n, _, _ in drifts]) / max(1, self.plan["n_distinct"])
         self.figures = {
@@ -302,6 +302,8 @@ class Tiles:
 
         found = estimate_from(probed, plan["n_distinct"], around, None if number else self.config.noise)
         self._gathered = {}
+        if number == 0:
+            found = taken_off.level_by(found, probed, self._around, self.model, self.config, self.threads)
         _write(path, json.dumps(asdict(found)).encode())
         return found
 
@@ -322,8 +324,13 @@ class Tiles:
 
     def _judge(self, level: NoiseLevel) -> denoiser.Judge:
         """The points that stand for the whole cloud: those nearest to the first of all probes, as in memory."""
-        centre = np.array(self.plan["probes"][0])
-        most = min(risk.MOST_POINTS, self.plan["n_distinct"])
+        points, identity = self._around(np.array(self.plan["probes"][0]), risk.MOST_POINTS)
+        some = risk.Risk(points, identity, level.as_read, self.config.seed, self.threads)
+        return denoiser.Judge(some, level, self.plan["diagonal"], self.model, self.config, self.threads)
+
+    def _around(self, centre: Points, most: int) -> taken_off.Sample:
+        """So many points nearest to a place, as they are in the file."""
+        most = min(most, self.plan["n_distinct"])
         part = self._part(int(_cell_of(centre[None], self.plan["cuts"])[0]), 0)
         cell = int(_cell_of(centre[None], self.plan["cuts"])[0])
         margin = max(float(np.ptp(part.points, axis=0).max()), 1e-12)
@@ -337,8 +344,7 @@ class Tiles:
             nearest = np.argpartition(distance, most)[:most]
             tile = _Part(tile.points[nearest], tile.identity[nearest])
         order = spatial_order(tile.points)
-        some = risk.Risk(tile.points[order], tile.identity[order], level, self.config.seed, self.threads)
-        return denoiser.Judge(some, level, self.plan["diagonal"], self.model, self.config, self.threads)
+        return tile.points[order], tile.identity[order]
 
     def _drift(self, cell: int, number: int) -> tuple[int, float, float]:
         """How many points a cell has, and how far its surface moved in all passes, at all and inward."""

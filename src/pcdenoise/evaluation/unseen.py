@@ -17,6 +17,8 @@ N_PLACES = 1000
 _NEAREST = 16  # cleaned points judged at a place
 _CLEAR_ASPECT = 4.4
 _FEWEST, _MOST = 32, 512
+_MOST_LEVERAGE = 0.5
+"""A point of full leverage is fitted exactly, whatever its error."""
 
 
 class Unseen:
@@ -49,7 +51,8 @@ class Unseen:
         """Root mean square height of cleaned points over the surface, at places where one shows; NaN without any.
 
         The surface is a quadric through the held points. What its own uncertainty adds, the held noise's variance times the
-        leverage of the place, is subtracted: the square is unbiased where the surface is a quadric, whatever the noise.
+        leverage of the place, is subtracted: the square is unbiased where the surface is a quadric, whatever the noise. Points
+        over which the quadric is hardly known, beside the held points or between two rows of them, do not count.
         """
         points = points[spatial_order(points)]
         if not len(self.centres) or len(points) < _NEAREST:
@@ -62,8 +65,12 @@ class Unseen:
         terms = _terms(u, v)
         squared = (height - np.einsum("mkt,mt->mk", terms, self._coefficients)) ** 2
         leverage = np.einsum("mkt,mts,mks->mk", terms, self._information, terms)
-        mean: NDArray[np.float64] = (squared - self._variance[:, None] * leverage).mean(axis=1) * self._radius**2
-        return float(np.sqrt(max(mean.mean(), 0.0)))
+        known = leverage < _MOST_LEVERAGE
+        squared = np.where(known, squared - self._variance[:, None] * leverage, 0.0).sum(axis=1)
+        number = known.sum(axis=1)
+        counted = number >= _NEAREST / 4
+        mean: NDArray[np.float64] = squared[counted] / number[counted] * self._radius[counted] ** 2
+        return float(np.sqrt(max(mean.mean(), 0.0))) if counted.any() else float("nan")
 
 
 def halves(points: Points, most: int, seed: int = 0) -> tuple[Points, Points]:
