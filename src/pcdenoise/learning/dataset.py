@@ -163,8 +163,8 @@ def draw_cloud(surface: Surface, neighbours: int, rng: np.random.Generator) -> T
 def measured(surface: Surface, rng: np.random.Generator) -> Array:
     """(N, 3) what a scanner would give of a surface: 120 to 200 thousand points with noise of one of the laws, no gross errors.
 
-    The noise, 0.02 to 0.2 % of the radius, is what scanners have rather than what they are tested with: up to a third of the spacing of
-    the points. A cloud of little noise, cleaned, is a surface by which much noise can be taught (distill.py).
+    The noise, 0.02 to 0.2 % of the radius, is what scanners have rather than what they are tested with: up to a third of the
+    spacing of the points. A cloud of little noise, cleaned, is a surface by which much noise can be taught (distill.py).
     """
     n_points = int(np.exp(rng.uniform(np.log(120_000), np.log(200_000))))
     std = float(np.exp(rng.uniform(np.log(0.0002), np.log(0.002))))
