@@ -76,7 +76,7 @@ class NoiseLevel:
         return replace(self, std=std, scale_points=scale_points, times_read=times_read)
 
     @property
-    def is_noise(self) -> float:
+    def share_of_noise(self) -> float:
         """How far what a place shows is noise: 0 where the smallest neighbourhood is much larger than the noise, to 1."""
         return float(np.clip((self.scale_points - _PLACES_FROM) / (_PLACES_IN_FULL - _PLACES_FROM), 0, 1))
 
@@ -173,7 +173,7 @@ def by_place(points: Points, identity: Identity, level: NoiseLevel, threads: int
     """
     if level.times_read != 1:
         return level.times_read * by_place(points, identity, level.as_read, threads)
-    everywhere, share = np.full(len(points), level.std), level.is_noise
+    everywhere, share = np.full(len(points), level.std), level.share_of_noise
     if level.is_known or level.std <= 0 or share == 0:
         return everywhere
     places, std = _readings(points, drawn_by(identity, _PLACES_SEED), level, threads)

@@ -159,11 +159,12 @@ class _Cloud:
         self.diagonal = float(np.linalg.norm(np.ptp(self.start, axis=0))) if len(self.start) else 0.0
 
     def _level(self, model: Model | None) -> NoiseLevel:
-        """The noise as neighbours disagree by it, then as a pass takes it off some of the points."""
+        """The noise as neighbours disagree by it, then, where a network cleans, as a pass takes it off some of the points."""
+        model = model if self.config.method == "network" else None
         read = estimate_at(self.start, self.probes, self.threads, self.config.noise)
         first = np.argsort(drawn_by(self.identity[self.probes], self.config.seed))[: taken_off.N_SAMPLES]
         centres = self.start[self.probes[first]]
-        return taken_off.level_by(read, centres, self._around, model, self.config, self.threads)
+        return taken_off.level_by(read, centres, self._around, model, self.config.seed, self.threads)
 
     def _around(self, centre: Points, most: int) -> taken_off.Sample:
         if most >= len(self.start):

@@ -14,7 +14,6 @@ import numpy as np
 from pcdenoise.cloud.neighbours import Identity
 from pcdenoise.cloud.noise_level import NoiseLevel
 from pcdenoise.cloud.scan import Points, within
-from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import network_pass
 from pcdenoise.networks.store import Model, ProjectionSettings
 
@@ -41,24 +40,16 @@ def level_by(
     centres: Points,
     around: Callable[[Points, int], Sample],
     model: Model | None,
-    config: DenoiseConfig,
+    seed: int,
     threads: int,
 ) -> NoiseLevel:
     """The level, no lower than as it was read from neighbours, by what the model takes off at up to N_SAMPLES of (M, 3) places.
 
     around: gives so many points nearest to a place. Noise that is told, and what no projection network cleans, stays as it is.
     """
-    of_projection = model is not None and isinstance(model.config.settings, ProjectionSettings)
-    if (
-        not of_projection
-        or config.method != "network"
-        or read.is_known
-        or not read.is_surface
-        or read.std <= 0
-        or read.is_noise == 0
-    ):
+    is_seen = read.is_surface and read.std > 0 and read.share_of_noise > 0
+    if model is None or not isinstance(model.config.settings, ProjectionSettings) or read.is_known or not is_seen:
         return read
-    assert model is not None
     low, high = _SAMPLE_POINTS
     most = int(np.clip(_SAMPLE_SCALES * read.scale_points, low, high))
     is_whole = read.n_points <= N_SAMPLES * most
@@ -67,7 +58,7 @@ def level_by(
     def factor(level: NoiseLevel) -> float:
         taken = told = 0.0
         for centre, points, identity in samples:
-            moved, noise = network_pass.projection(points, identity, level, model, [config.seed], threads, lambda _share: None)
+            moved, noise = network_pass.projection(points, identity, level, model, [seed], threads, lambda _share: None)
             squared = ((within(FURTHEST_STDS * noise, points, moved) - points) ** 2).sum(axis=1)
             if not is_whole:
                 distance = ((points - centre) ** 2).sum(axis=1)
@@ -79,7 +70,7 @@ def level_by(
     level = read
     for _turn in range(_MOST_TURNS):
         times = min(max(factor(level), 1.0), _MOST_TIMES)
-        times **= read.is_noise * float(np.clip(np.log(times / _UNSURE) / np.log(_SURE / _UNSURE), 0, 1))
+        times **= read.share_of_noise * float(np.clip(np.log(times / _UNSURE) / np.log(_SURE / _UNSURE), 0, 1))
         settled = times < _SETTLED * level.times_read
         level = read.times(times)
         if settled:

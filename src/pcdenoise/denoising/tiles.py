@@ -303,7 +303,8 @@ class Tiles:
         found = estimate_from(probed, plan["n_distinct"], around, None if number else self.config.noise)
         self._gathered = {}
         if number == 0:
-            found = taken_off.level_by(found, probed, self._around, self.model, self.config, self.threads)
+            model = self.model if self.config.method == "network" else None
+            found = taken_off.level_by(found, probed, self._around, model, self.config.seed, self.threads)
         _write(path, json.dumps(asdict(found)).encode())
         return found
 
