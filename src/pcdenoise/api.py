@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from pcdenoise.cloud.scan import Scan
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import denoiser
+from pcdenoise.denoising.alignment import columns_to_align_by, groups_of
 from pcdenoise.denoising.denoiser import Progress, Result
 from pcdenoise.errors import UsageError
 from pcdenoise.networks import store
@@ -39,7 +40,13 @@ def denoise(
     if chosen.method != "network":
         model = None
     loaded = model if isinstance(model, Model) or model is None else store.load(model)
-    return denoiser.denoise(rows, loaded, chosen, on_progress)
+    if not isinstance(points, Scan):
+        if chosen.align_by:
+            raise UsageError("align_by: names columns, which an array has not; give a Scan")
+        return denoiser.denoise(rows, loaded, chosen, on_progress)
+    names = columns_to_align_by(points, chosen.align_by, loaded.config.align_by if loaded else ())
+    shift = denoiser.shift_of(rows, groups_of(points, names), loaded, chosen)[0] if names else None
+    return denoiser.denoise(rows, loaded, chosen, on_progress, shift=shift)
 
 
 def _configured(settings: dict[str, Any]) -> DenoiseConfig:

@@ -32,8 +32,12 @@ class DenoiseConfig(Settings):
     noise: float | None = Field(
         None, gt=0, allow_inf_nan=False, description="Standard deviation of the noise, in the scan's unit; estimated by default."
     )
+    align_by: tuple[str, ...] | None = Field(
+        None,
+        description="Columns: rows that agree in them are off together and first shifted together; by default the model's.",
+    )
     strength: float = Field(1.0, ge=0, le=1, description="Share of the move that is carried out.")
-    max_move: float | None = Field(None, gt=0, description="Longest move of any point, in the scan's unit.")
+    max_move: float | None = Field(None, gt=0, allow_inf_nan=False, description="Longest move of any point, in the scan's unit.")
     relax_steps: int = Field(4, ge=0, le=100, description="Steps toward even spacing, within the noise; 0 for none.")
     outliers: Literal["keep", "flag", "remove"] = Field("keep", description="What becomes of isolated points.")
     uncertainty: bool = Field(False, description="Say for every point how far it may still be off, as a standard deviation.")

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from pcdenoise.cloud.scan import Mask, Scan
+    from pcdenoise.cloud.scan import Mask, Points, Scan
     from pcdenoise.config import DenoiseConfig
     from pcdenoise.denoising.denoiser import Result
     from pcdenoise.evaluation.report import Page
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from pcdenoise.networks.store import Model
 
 _PIECE_ROWS = 250_000
+_MOST_GROUPS = 50  # of which --verbose says how they are shifted
 
 
 def chosen_model(name: str | None, settings: DenoiseConfig) -> Model | None:
@@ -151,6 +152,10 @@ class Cleaning:
         added = columns_to_add(scan, [option for option, is_asked in asked.items() if is_asked])
         if self.colour:
             refuse_colourless(scan)
+        if self.config.align_by:
+            from pcdenoise.denoising.alignment import check_columns
+
+            check_columns(scan, self.config.align_by)
         written = format_of(job.target, self.format) or io.SUFFIXES.get(job.target.suffix.lower())
         if written and not self.drop_attributes:
             io.refuse_losses(scan.with_attributes(**added), job.target, written)
@@ -234,10 +239,13 @@ class Cleaning:
         scan = io.read(job.source, format=format_of(job.source, self.format))
         self._refuse(job, scan)
         with self.console.progress(job.source.name) as on_progress:
+            on_progress("aligning", 0.0)
+            movable, seen = self.selection.masks(scan)
+            shift, aligned = self._shift(job, scan, seen)
             if self.selection == selection.Selection():
-                result = denoiser.denoise(scan.points, self.model, self.config, on_progress)
+                result = denoiser.denoise(scan.points, self.model, self.config, on_progress, shift=shift)
             else:
-                result = denoise_part(scan.points, *self.selection.masks(scan), self.model, self.config, on_progress)
+                result = denoise_part(scan.points, movable, seen, self.model, self.config, on_progress, shift=shift)
         for step in result.steps:
             self.console.detail(", ".join(f"{name.replace('_', ' ')} {figure(value)}" for name, value in step.figures.items()))
         check_drift(job.target, result.figures["drift"], result.figures["noise"], self.max_drift)
@@ -246,7 +254,7 @@ class Cleaning:
             self._written(scan, result), job.target, format=format_of(job.target, self.format), overwrite=self.overwrite,
             drop_attributes=self.drop_attributes, provenance=outputs.provenance("denoise", self.settings),
         )  # fmt: skip
-        figures = {"points": len(scan), **result.figures, "seconds": round(time.perf_counter() - started, 3)}
+        figures = {"points": len(scan), **result.figures, **aligned, "seconds": round(time.perf_counter() - started, 3)}
         unit = unit_of(scan)
         if picture := self.pictures.get(job.source):
             outputs.save_before_after(
@@ -260,6 +268,29 @@ class Cleaning:
             self.console.note(f"{job.source}: {text}")
         self.console.note(f"{job.target}: {_summary(figures)}" + (f"; picture {picture}" if picture else ""))
         return figures
+
+    def _shift(self, job: Job, scan: Scan, seen: Mask) -> tuple[Points | None, Figures]:
+        """(N, 3) by how much rows are moved so that groups of them meet, if they are to be aligned, and figures of that."""
+        import numpy as np
+
+        from pcdenoise.denoising import denoiser
+        from pcdenoise.denoising.alignment import columns_to_align_by, groups_of
+
+        of_model = self.model.config.align_by if self.model else ()
+        names = columns_to_align_by(scan, self.config.align_by, of_model)
+        if not names:
+            if self.config.align_by is None and of_model:
+                self.console.note(f"{job.source}: not aligned by {','.join(of_model)} as the model asks: no such columns")
+            return None, {}
+        groups, shift = groups_of(scan, names), np.zeros((len(scan), 3))
+        shift[seen], figures = denoiser.shift_of(scan.points[seen], groups[seen], self.model, self.config)
+        rows, sizes = np.unique(groups, return_index=True, return_counts=True)[1:]
+        for row, n in zip(rows[:_MOST_GROUPS], sizes, strict=False):
+            values = ", ".join(f"{name} {scan.attributes[name][row]}" for name in names)
+            self.console.detail(f"{values}: {counted(int(n), 'point')} shifted by {', '.join(map(figure, shift[row]))}")
+        if len(rows) > _MOST_GROUPS:
+            self.console.detail(f"and {len(rows) - _MOST_GROUPS:,} more groups")
+        return shift, {"aligned_by": ",".join(names), **figures}
 
     def _written(self, scan: Scan, result: Result) -> Scan:
         """The moved scan as it is to be written: colours, further columns, without the rows that were not wanted."""
@@ -293,6 +324,9 @@ def _summary(figures: Figures) -> str:
     parts = [counted(figures["points"], "point")]
     if "points_selected" in figures:
         parts.append(f"{figures['points_selected']:,} selected")
+    if "aligned_by" in figures:
+        off = f"off by {figure(figures['offset'])}" if figures["offset"] else "which agree"
+        parts.append(f"{counted(figures['groups'], 'group')} by {figures['aligned_by']} {off}")
     parts.append(f"noise {figure(figures['noise'])}" if figures["is_surface"] else "no surface to clean")
     parts.append(f"moved {figure(figures['move_median'])} (median), at most {figure(figures['move_max'])}")
     if figures["points_left_alone"]:

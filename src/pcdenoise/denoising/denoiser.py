@@ -20,6 +20,7 @@ from pcdenoise.cloud.noise_level import NoiseLevel, by_place, estimate_at, probe
 from pcdenoise.cloud.scan import Mask, Points, check_extent, within
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import classical, network_pass, outliers, taken_off, uncertainty
+from pcdenoise.denoising.alignment import Alignment, Groups, Heights, align, heights
 from pcdenoise.denoising.relaxation import relax, without_low_frequencies
 from pcdenoise.denoising.risk import Risk
 from pcdenoise.errors import UsageError
@@ -77,16 +78,18 @@ def denoise(
     on_progress: Progress | None = None,
     *,
     level: NoiseLevel | None = None,
+    shift: Points | None = None,
 ) -> Result:
     """Moves (N, 3) float64 points onto the surface they were measured on; row i stays row i.
 
+    level: the noise, if it is known. shift (N, 3): where rows are moved before they are cleaned, see `alignment_of`.
     Rows that are not finite stay as they are; exact duplicates move together; the network leaves a cloud in which no scale
     shows a surface as it is. Raises UsageError when the network is asked for without a model.
     """
-    cloud = _Cloud(points, model, config, level)
+    cloud = _Cloud(points, model, config, level, shift)
     found = np.zeros(len(points), dtype=bool)
     if config.outliers != "keep" and len(cloud.start) >= FEWEST_POINTS:
-        found = cloud.to_rows(outliers.find(cloud.start, level=cloud.level.as_read, threads=cloud.threads), False)
+        found = cloud.to_rows(outliers.find(cloud.aligned, level=cloud.level.as_read, threads=cloud.threads), False)
     steps = list(_passes(cloud, model, config, on_progress or (lambda _task, _share: None)))
     moved = steps[-1].points if steps else cloud.start
     unmoved = cloud.unmoved(moved)
@@ -112,7 +115,7 @@ def denoise(
     if config.uncertainty:
         off = np.full(len(moved), np.nan)
         if cloud.level.is_surface:
-            noise = by_place(cloud.start, cloud.identity, cloud.level.as_read, cloud.threads)
+            noise = by_place(cloud.aligned, cloud.identity, cloud.level.as_read, cloud.threads)
             cleaned = cloud.reached[spatial_order(cloud.reached)]
             off = uncertainty.estimate(cleaned, cloud.start, cloud.reached, moved, noise, cloud.threads)
         std = cloud.to_rows(off, np.nan)
@@ -120,9 +123,35 @@ def denoise(
     return Result(placed[-1].points if placed else points.copy(), found, unmoved, figures, placed, std)
 
 
-def level_of(points: Points, model: Model | None, config: DenoiseConfig) -> NoiseLevel:
+def level_of(points: Points, model: Model | None, config: DenoiseConfig, shift: Points | None = None) -> NoiseLevel:
     """The noise level by which `denoise` would clean (N, 3) points."""
-    return _Cloud(points, model, config).level
+    return _Cloud(points, model, config, shift=shift).level
+
+
+def alignment_of(points: Points, groupings: list[Groups], model: Model | None, config: DenoiseConfig) -> list[Alignment]:
+    """By how much each group of (N, 3) points is off against the others, by one grouping (N,) or another.
+
+    Of rows that coincide the first one counts. No group is moved where there is nothing to clean or no surface.
+    """
+    cloud = _Cloud(points, model, config)
+    distinct = [cloud.of_rows(groups) for groups in groupings]
+    if not most_passes(len(cloud.start), cloud.level, config):
+        return [Alignment(np.zeros((int(groups.max(initial=0)) + 1, 3)), 0.0) for groups in groupings]
+    plain = config.model_copy(update={"relax_steps": 0})
+
+    def cleaned(points: Points) -> Points:
+        return one_pass(points, cloud.identity, cloud.level, cloud.diagonal, model, plain, cloud.threads)
+
+    first: Heights = heights(cloud.start, cleaned(cloud.start), cloud.threads)
+    return [align(cloud.start, groups, cleaned, cloud.threads, first) for groups in distinct]
+
+
+def shift_of(points: Points, group: Groups, model: Model | None, config: DenoiseConfig) -> tuple[Points, dict[str, float]]:
+    """(N, 3) by how much each row is moved so that its group meets the others, and figures: groups, offset (root mean square)."""
+    alignment = alignment_of(points, [group], model, config)[0]
+    shift = alignment.shift[group]
+    offset = float(np.sqrt((shift**2).sum(axis=1).mean())) if len(shift) else 0.0
+    return shift, {"groups": len(alignment.shift), "offset": offset}
 
 
 def iterate(points: Points, model: Model | None, config: DenoiseConfig) -> Iterator[Step]:
@@ -135,10 +164,17 @@ def iterate(points: Points, model: Model | None, config: DenoiseConfig) -> Itera
 class _Cloud:
     """The distinct finite points of an input in spatial order around their own origin, and the way back to its rows.
 
-    reached (D, 3): where the passes so far led them, before strength and limit.
+    start, aligned, reached (D, 3): as measured; once each group is shifted; where the passes so far led them from there.
     """
 
-    def __init__(self, points: Points, model: Model | None, config: DenoiseConfig, level: NoiseLevel | None = None) -> None:
+    def __init__(
+        self,
+        points: Points,
+        model: Model | None,
+        config: DenoiseConfig,
+        level: NoiseLevel | None = None,
+        shift: Points | None = None,
+    ) -> None:
         self.config, self.rows = config, points
         self.threads = config.threads or os.cpu_count() or 1
         self.finite: Mask = np.logical_and.reduce(np.isfinite(points), axis=1)
@@ -150,10 +186,11 @@ class _Cloud:
         order = spatial_order(usable[first])
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
-        self.start: Points = usable[first][order] - self.origin
-        self.reached = self.start
+        self._first, self._row = np.flatnonzero(self.finite)[first[order]], back[place]
+        self.start: Points = points[self._first] - self.origin
+        self.aligned: Points = self.start if shift is None else self.start + self.of_rows(shift)
+        self.reached = self.aligned
         self.identity: Identity = identity[first][order]
-        self._row = back[place]
         self.probes = probes(drawn_by(self.identity, config.seed))
         self.level: NoiseLevel = level or self._level(model)
         self.diagonal = float(np.linalg.norm(np.ptp(self.start, axis=0))) if len(self.start) else 0.0
@@ -161,17 +198,21 @@ class _Cloud:
     def _level(self, model: Model | None) -> NoiseLevel:
         """The noise as neighbours disagree by it, then, where a network cleans, as a pass takes it off some of the points."""
         model = model if self.config.method == "network" else None
-        read = estimate_at(self.start, self.probes, self.threads, self.config.noise)
+        read = estimate_at(self.aligned, self.probes, self.threads, self.config.noise)
         first = np.argsort(drawn_by(self.identity[self.probes], self.config.seed))[: taken_off.N_SAMPLES]
-        centres = self.start[self.probes[first]]
+        centres = self.aligned[self.probes[first]]
         return taken_off.level_by(read, centres, self._around, model, self.config.seed, self.threads)
 
     def _around(self, centre: Points, most: int) -> taken_off.Sample:
-        if most >= len(self.start):
-            return self.start, self.identity
-        distance = ((self.start - centre) ** 2).sum(axis=1)
+        if most >= len(self.aligned):
+            return self.aligned, self.identity
+        distance = ((self.aligned - centre) ** 2).sum(axis=1)
         rows = np.sort(np.argpartition(distance, most)[:most])
-        return self.start[rows], self.identity[rows]
+        return self.aligned[rows], self.identity[rows]
+
+    def of_rows(self, values: NDArray[Any]) -> NDArray[Any]:
+        """(D, …) values of the distinct points, from those of all rows (N, …)."""
+        return values[self._first]
 
     def to_rows(self, values: NDArray[Any], missing: Any) -> NDArray[Any]:
         """Values of the distinct points (D, …) spread to all rows (N, …); positions get their origin back."""
@@ -247,7 +288,7 @@ def _passes(
 
     `is_judged`: the error before and after each pass is estimated, as `auto` does anyway, at the cost of another pass.
     """
-    points, level, judge = cloud.start, cloud.level, None
+    points, level, judge = cloud.aligned, cloud.level, None
     n_passes = most_passes(len(points), level, config)
     if n_passes and (config.iters == "auto" or is_judged):
         risk = Risk(points, cloud.identity, level.as_read, config.seed, cloud.threads)

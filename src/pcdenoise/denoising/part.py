@@ -22,6 +22,8 @@ def denoise_part(
     model: Model | None,
     config: DenoiseConfig,
     on_progress: Progress | None = None,
+    *,
+    shift: Points | None = None,
 ) -> Result:
     """`denoise`, but only `movable` rows (N,) move, and only `seen` rows (N,) have a say; every other row keeps each bit.
 
@@ -31,7 +33,7 @@ def denoise_part(
     """
     usable = np.logical_and.reduce(np.isfinite(points), axis=1)
     movable = movable & seen
-    level = level_of(points[seen], model, config)
+    level = level_of(points[seen], model, config, None if shift is None else shift[seen])
     worked = seen & usable
     if (movable & usable).any():
         passes = 10 if config.iters == "auto" else config.iters
@@ -41,7 +43,7 @@ def denoise_part(
     else:
         worked &= False
     rows = np.flatnonzero(worked)
-    result = denoise(points[rows], model, config, on_progress, level=level)
+    result = denoise(points[rows], model, config, on_progress, level=level, shift=None if shift is None else shift[rows])
 
     chosen = movable[rows]
     moved, outlier, left_alone = points.copy(), np.zeros(len(points), np.bool_), np.ones(len(points), np.bool_)

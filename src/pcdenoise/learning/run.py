@@ -49,7 +49,7 @@ class TrainingSummary:
     """What a run did. error: root mean square distance to the targets in the last hundred steps, of the noise.
 
     The targets are on the surface; with `total` they are the points that its prior draws.
-    verdict: which weights are kept after an adaptation, and why; else empty.
+    verdict: which weights are kept after an adaptation, and why, and how scans are aligned; else empty.
     """
 
     steps: int
@@ -76,6 +76,7 @@ class Run:
         self.step, self.points, self._before_s, self._began = 0, 0, 0.0, time.monotonic()
         self._errors: list[float] = []
         self._verdict = ""
+        self.align_by: tuple[str, ...] = ()
         self._logged = 0
 
     @property
@@ -107,7 +108,8 @@ class Run:
     @property
     def summary(self) -> TrainingSummary:
         """The record so far."""
-        return TrainingSummary(self.step, self.points, self.seconds, self.recent_error, self._verdict)
+        aligned = f"; scans are aligned by {' and '.join(self.align_by)} first" if self.align_by else ""
+        return TrainingSummary(self.step, self.points, self.seconds, self.recent_error, self._verdict + aligned)
 
     def learn(self, signal: Signal, cloud: Any) -> None:
         """One step on one cloud a process; one without judged points or with a loss that is no number teaches nothing."""
@@ -245,6 +247,7 @@ class Run:
             training=training,
             scores={},
             card=self._card(),
+            align_by=self.align_by,
         )
 
     def _card(self) -> str:

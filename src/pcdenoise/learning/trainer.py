@@ -27,6 +27,7 @@ from pcdenoise.learning.run import CHECKPOINT, TEACHER, OnProgress, Run, Signal,
 from pcdenoise.learning.scans import ScanSource, parts_from
 from pcdenoise.learning.sources import NoisyClouds, are_scans, noisy_from, surfaces_from
 from pcdenoise.learning.split import split_loss
+from pcdenoise.learning.structure import shared_by
 from pcdenoise.learning.supervised import supervised_loss
 from pcdenoise.learning.total import total_loss
 from pcdenoise.networks import store
@@ -56,7 +57,8 @@ def train(
 
     The folder also gets training.jsonl, one line per fifty steps. An interrupt (Ctrl-C) saves what was learned and is passed on.
     Where split or distill learn from scans alone, the shipped model is adapted to them unless `init` says otherwise ("none": a
-    new network), and comes back as it was unless the change shows on a quarter of the points, which no step learns from.
+    new network), and comes back as it was unless the change shows on a quarter of the points, which no step learns from. Where
+    beams, sweeps or flight lines are off against each other, the model says so, and scans are aligned by them first.
     Under torchrun each process learns from clouds of its own, gradients are averaged, and the first process writes.
     A run that is resumed has the start of its first part, and its length if no other is given. An unfinished run in the folder is
     only replaced with `overwrite`.
@@ -109,6 +111,8 @@ def _trained(run: Run, adapts: bool, resume: bool, on_progress: OnProgress) -> T
                         on_progress(run.state, run.progress)
             if isinstance(before, ProjectionNetwork) and ranks.is_first:
                 run.judge(before, _judges(lessons.noisy, config.seed, before.config.neighbours), on_progress)
+                on_progress("looking for offsets", 1.0)
+                run.align_by = shared_by(config.data, store.Model.of(run.average, output.name), config.seed, config.threads)
             if not run.points and not adapts:
                 raise UsageError(
                     f"{output}: no cloud taught anything in {run.step} steps; learn for longer, or from larger scans"

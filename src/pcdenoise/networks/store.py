@@ -3,7 +3,7 @@
 Weights are arrays until somebody asks for the network itself: compiled inference (fused.py) does without torch.
 
 NAME/weights.safetensors   tensors, float32
-NAME/config.json           {"network": …, "settings": {…}, "training": {…}, "scores": {…}}
+NAME/config.json           {"network": …, "settings": {…}, "align_by": […], "training": {…}, "scores": {…}}
 NAME/README.md             the card: data, noise, seed, command, scores
 """
 
@@ -62,12 +62,13 @@ class _MCConvSettings(_Settings):
 
 
 class ModelConfig(BaseModel):
-    """What config.json holds."""
+    """What config.json holds. align_by: columns by which the scans it was adapted to are aligned, see denoising.alignment."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     network: Literal["projection", "mcconv"]
     settings: ProjectionSettings | _MCConvSettings
+    align_by: tuple[str, ...] = ()
     summary: str = ""
     training: dict[str, Any] = Field(default_factory=dict)
     scores: dict[str, Any] = Field(default_factory=dict)
@@ -166,12 +167,20 @@ def _parsed(data: bytes, config: ModelConfig, path: Path) -> Weights:
 
 
 def save(
-    network: Network, folder: Path, *, summary: str, training: Mapping[str, Any], scores: Mapping[str, Any], card: str
+    network: Network,
+    folder: Path,
+    *,
+    summary: str,
+    training: Mapping[str, Any],
+    scores: Mapping[str, Any],
+    card: str,
+    align_by: tuple[str, ...] = (),
 ) -> None:
     """Writes a model folder; every file appears whole or not at all. Raises ModelError if one cannot be written."""
     from safetensors.numpy import save as serialise
 
-    config = _describe(network).model_copy(update={"summary": summary, "training": dict(training), "scores": dict(scores)})
+    about = {"align_by": align_by, "summary": summary, "training": dict(training), "scores": dict(scores)}
+    config = _describe(network).model_copy(update=about)
     files = {
         WEIGHTS: serialise(_weights(network)),
         CONFIG: (config.model_dump_json(indent=1) + "\n").encode(),
