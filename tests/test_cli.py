@@ -192,6 +192,10 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(sphere: Path, capsys: pyte
         (["-o", "c.xyz", "--only-class", "2"], 3, "has no classes"),
         (["-o", "c.abc"], 3, "c.abc: no suffix tells its format"),
         (["-o", "c.bin", "--method", "mean"], 3, "would drop"),
+        (["-o", "c.bin", "--outliers", "flag", "--drop-attributes"], 3, "bin cannot hold outlier, which is asked for"),
+        (["-o", "locked.xyz", "--overwrite"], 3, "locked.xyz: is read-only"),
+        (["-o", "c.xyz", "--max-move", "inf"], 2, "--max-move: must be a finite number"),
+        (["-o", "c.xyz", "--noise", "1e300"], 2, "--noise: must be less than"),
         (["-o", "c.xyz", "--tile", "1000", "--outliers", "remove"], 2, "use --outliers flag, or leave out --tile"),
     ],
 )
@@ -200,10 +204,11 @@ def test_a_dry_run_refuses_what_the_run_refuses(
 ) -> None:
     monkeypatch.chdir(sphere.parent)
     Path("there.xyz").touch()
+    Path("locked.xyz").touch(mode=0o444)
     for command in (["denoise", "sphere.xyz", *options, "--dry-run"], ["denoise", "sphere.xyz", *options]):
         assert main(command) == code
         assert words in the_one_line(capsys.readouterr().err)
-    assert sorted(path.name for path in Path().iterdir()) == ["sphere.xyz", "there.xyz"]
+    assert sorted(path.name for path in Path().iterdir()) == ["locked.xyz", "sphere.xyz", "there.xyz"]
 
 
 def test_a_plan_goes_on_past_a_broken_input(

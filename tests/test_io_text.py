@@ -97,6 +97,35 @@ def test_units_in_brackets_do_not_hide_a_coordinate_and_wide_padding_is_no_numbe
         xyz.read(wide, "too wide")
 
 
+@pytest.mark.parametrize(
+    ("title", "axes"),
+    [
+        ("id,Easting,Northing,Height,label", (1, 2, 3)),
+        ("ID,E,N,H", (1, 2, 3)),
+        ("Northing [m],Easting [m],Elevation [m],class", (1, 0, 2)),
+        ("e,n,h,x,y,z", (3, 4, 5)),
+        ("z,northing,easting", (2, 1, 0)),
+    ],
+)
+def test_surveyors_names_of_coordinates_are_known_and_xyz_comes_first(title: str, axes: tuple[int, int, int]) -> None:
+    rows = np.arange(60.0).reshape(10, 6)[:, : title.count(",") + 1] ** 2
+    raw = title + "\n" + "\n".join(",".join(f"{value:.1f}" for value in row) for row in rows) + "\n"
+    scan = xyz.read(raw.encode(), "survey.csv")
+    assert np.array_equal(scan.points, rows[:, axes])
+    assert len(scan.attributes) == rows.shape[1] - 3
+
+
+@pytest.mark.parametrize("first", [0, 1, 1000])
+def test_a_column_that_counts_rows_is_no_coordinate(first: int, rng: np.random.Generator) -> None:
+    numbers = rng.random((50, 3))
+    counted = "".join(f"{first + i} {x:.3f} {y:.3f} {z:.3f}\n" for i, (x, y, z) in enumerate(numbers))
+    assert "its first column counts the rows" in io_samples.refusal(xyz.read, counted.encode(), "a.txt")
+    named = xyz.read(b"id x y z\n" + counted.encode(), "a.txt")
+    assert np.abs(named.points - numbers).max() <= 5e-4 + 1e-12
+    profile = "".join(f"{i} {x:.3f} {y:.3f}\n" for i, (x, y, _) in enumerate(numbers))
+    assert xyz.read(profile.encode(), "profile.txt").points[:, 0].tolist() == list(range(50))
+
+
 def test_an_attribute_of_the_file_can_be_replaced() -> None:
     raw = io_samples.XYZ["header in another order"]
     out = written(xyz.read(raw, "sample").with_attributes(Intensity=np.array([70, 80, 90])))
@@ -143,9 +172,9 @@ def test_the_careful_reader_and_numpy_agree(rng: np.random.Generator) -> None:
 
 def test_rows_beyond_one_block_are_read_and_rewritten(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(text, "_BLOCK_BYTES", 100)
-    raw = b"".join(b"%d, %d , 7,%s\n" % (i, -i, b"w" * (i % 50)) for i in range(200))
+    raw = b"".join(b"%d, %d , 7,%s\n" % (2 * i, -i, b"w" * (i % 50)) for i in range(200))
     scan = xyz.read(raw, "sample")
-    assert scan.points[:, 0].tolist() == list(range(200))
+    assert scan.points[:, 0].tolist() == list(range(0, 400, 2))
     moved = scan.points.copy()
     moved[::3, 1] += 0.5
     assert np.array_equal(xyz.read(written(scan.moved_to(moved)), "back").points, moved)

@@ -3,9 +3,10 @@
     python benchmarks/adaptation/run.py [--laws quantised beam-bias] [--meshes MESH...] [--budget-s 180] [--json FILE]
 
 Each law is put on procedural shapes, whose surface is known; each mesh is scanned by the simulated HDL-64E with a bias per
-beam, and its file says of each point which beam and which pose it is from. The model learns from the noisy file alone, as in `pcdenoise train --data scan.ply --budget 3m`, and held-out points of
-the scan decide whether it is kept. `told` is the shipped model with `--noise`, as who knows the scanner would run it; `adapted`
-is what came back, `learned` what would have without that judgement, `aligned` the shipped model with `--align-by beam,pose`. Truth only reports, as shares of the noise.
+beam, and its file says of each point which beam and which pose it is from. The model learns from the noisy file alone, as in
+`pcdenoise train --data scan.ply --budget 3m`, and held-out points of the scan decide whether it is kept. `told` is the shipped
+model with `--noise`, as who knows the scanner would run it; `adapted` is what came back, `learned` what would have without that
+judgement, `aligned` the shipped model with `--align-by beam,pose`. Truth only reports, as shares of the noise.
 Not here: the adaptation (pcdenoise.learning.trainer).
 """
 
@@ -130,8 +131,8 @@ def main() -> None:
         shown = {name: "–" if row[name] is None else f"{row[name]:.3f}" for name in errors}
         noise = f"{row['noise']:.4f}, {row['noise_read']:.4f}"
         print(
-            f"| {row['scan']} | {noise} | {shown['shipped']} | {shown['told']} | {shown['aligned']} | {row['steps']} | {shown['adapted']} |"
-            f" {shown['learned']} | {row['verdict']} |",
+            f"| {row['scan']} | {noise} | {shown['shipped']} | {shown['told']} | {shown['aligned']} | {row['steps']} |"
+            f" {shown['adapted']} | {shown['learned']} | {row['verdict']} |",
             flush=True,
         )
     if options.json:

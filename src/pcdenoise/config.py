@@ -16,7 +16,7 @@ Signal = Literal["supervised", "split", "distill", "total"]
 class Settings(BaseModel):
     """Base of all settings."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class DenoiseConfig(Settings):
@@ -30,14 +30,14 @@ class DenoiseConfig(Settings):
         1, ge=1, le=64, description="Random choices of what the network looks at, over which its answer is averaged."
     )
     noise: float | None = Field(
-        None, gt=0, allow_inf_nan=False, description="Standard deviation of the noise, in the scan's unit; estimated by default."
+        None, gt=0, le=1e15, description="Standard deviation of the noise, in the scan's unit; estimated by default."
     )
     align_by: tuple[str, ...] | None = Field(
         None,
         description="Columns: rows that agree in them are off together and first shifted together; by default the model's.",
     )
     strength: float = Field(1.0, ge=0, le=1, description="Share of the move that is carried out.")
-    max_move: float | None = Field(None, gt=0, allow_inf_nan=False, description="Longest move of any point, in the scan's unit.")
+    max_move: float | None = Field(None, gt=0, description="Longest move of any point, in the scan's unit.")
     relax_steps: int = Field(4, ge=0, le=100, description="Steps toward even spacing, within the noise; 0 for none.")
     outliers: Literal["keep", "flag", "remove"] = Field("keep", description="What becomes of isolated points.")
     uncertainty: bool = Field(False, description="Say for every point how far it may still be off, as a standard deviation.")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -157,6 +157,9 @@ class Cleaning:
 
             check_columns(scan, self.config.align_by)
         written = format_of(job.target, self.format) or io.SUFFIXES.get(job.target.suffix.lower())
+        lost = io.losses(replace(scan, attributes=added, source=None), written) if written and added else []
+        if unheld := [name for name in added if f"column {name}" in lost]:
+            raise ScanError(f"{job.target}: {written} cannot hold {', '.join(unheld)}, which is asked for; write .ply or .las")
         if written and not self.drop_attributes:
             io.refuse_losses(scan.with_attributes(**added), job.target, written)
 
@@ -255,6 +258,8 @@ class Cleaning:
             drop_attributes=self.drop_attributes, provenance=outputs.provenance("denoise", self.settings),
         )  # fmt: skip
         figures = {"points": len(scan), **result.figures, **aligned, "seconds": round(time.perf_counter() - started, 3)}
+        if self.config.outliers == "remove":
+            figures["points_written"] = len(scan) - figures["outliers"]
         unit = unit_of(scan)
         if picture := self.pictures.get(job.source):
             outputs.save_before_after(
@@ -332,5 +337,5 @@ def _summary(figures: Figures) -> str:
     if figures["points_left_alone"]:
         parts.append(f"{figures['points_left_alone']:,} left alone")
     if figures.get("outliers"):
-        parts.append(f"{figures['outliers']:,} outliers")
+        parts.append(f"{figures['outliers']:,} outliers" + (" removed" if "points_written" in figures else ""))
     return ", ".join([*parts, f"{figures['seconds']:.1f} s"])

@@ -74,7 +74,9 @@ def denoise(
     sigma_d: SigmaD = None,
     sigma_n: SigmaN = None,
     strength: Annotated[float, option("--strength", help="Share of the move that is made, 0 to 1.")] = 1.0,
-    max_move: Annotated[float | None, option("--max-move", help="Longest move of a point, in the file's unit.")] = None,
+    max_move: Annotated[
+        float | None, option("--max-move", help="Longest move of a point, in the file's unit, before the file's own rounding.")
+    ] = None,
     max_drift: MaxDrift = None,
     outliers: Annotated[
         Literal["keep", "flag", "remove"], option("--outliers", help="Points far from any surface: keep, mark, or leave out.")

@@ -6,6 +6,7 @@ import glob
 import heapq
 import os
 import re
+import stat
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -149,11 +150,18 @@ def refuse_file(folder: Path) -> None:
         raise not_a_folder(str(folder))
 
 
+_WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
+
+
 def refuse_existing(targets: Sequence[Path | None], overwrite: bool) -> None:
-    """Raises ScanError before any work is done if a target exists and must not be replaced."""
+    """Raises ScanError before any work is done if a target exists and must not be replaced; who made it read-only meant it."""
     for target in targets:
-        if target is not None and target != STREAM and target.exists() and not overwrite:
+        if target is None or target == STREAM or not target.exists():
+            continue
+        if not overwrite:
             raise ScanError(f"{target}: the file exists; add --overwrite to replace it")
+        if target.is_file() and not target.stat().st_mode & _WRITABLE:
+            raise ScanError(f"{target}: is read-only, so that --overwrite leaves it; make it writable or write elsewhere")
 
 
 def refuse_unknown(targets: Sequence[Path], format: str | None) -> None:

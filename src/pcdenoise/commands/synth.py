@@ -45,7 +45,7 @@ def synth(
     seed: options.Seed = 0,
     quiet: options.Quiet = False,
 ) -> None:
-    """Make a data set: each surface as an evenly spaced clean cloud with colours, a noisy cloud per level, and its mesh.
+    """Make a data set: of each surface an evenly spaced clean cloud with colours, a noisy cloud per level, and its mesh, if any.
 
     Example: pcdenoise synth meshes/ shapes:20 -o data/ --points 20000 --levels 1,2
     """
@@ -84,7 +84,7 @@ class _Surface:
 def _surfaces(source: str, noise: str) -> Iterator[_Surface]:
     from pcdenoise.synthesis import meshes
 
-    shapes = re.fullmatch(r"shapes:(\d+)", source)
+    shapes = re.fullmatch(r"shapes:([1-9]\d*)", source)
     if shapes and noise == "lidar":
         raise UsageError(f"{source}: the lidar scans meshes; give a mesh file or another --noise")
     if shapes:

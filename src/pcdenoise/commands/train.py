@@ -69,7 +69,10 @@ def train(
     ] = 2,
     steps: Annotated[int | None, option("--steps", min=1, help="Stop after so many steps.")] = None,
     budget: Annotated[
-        str | None, option("--budget", metavar="TIME", help="Learn for so long: 90s, 20m, 1.5h. By default 20m.")
+        str | None,
+        option(
+            "--budget", metavar="TIME", help="Learn for so long: 90s, 20m, 1.5h, then judge for a minute or two. By default 20m."
+        ),
     ] = None,
     init: Annotated[
         str | None, option("--init", metavar="NAME|DIR", help="Start from this model, or none; scans: default.")

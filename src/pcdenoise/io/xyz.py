@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -21,6 +21,18 @@ _DELIMITERS = (ord(";"), ord(","), ord("\t"), None)
 _COMMENTS = (b"#", b"//")
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 _BOM = b"\xef\xbb\xbf"
+_AXES: tuple[Mapping[str, str], ...] = (
+    {"x": "x", "y": "y", "z": "z"},
+    {
+        **dict.fromkeys(("e", "east", "easting", "x_coord", "xcoord", "coord_x", "x coordinate"), "x"),
+        **dict.fromkeys(("n", "north", "northing", "y_coord", "ycoord", "coord_y", "y coordinate"), "y"),
+        **dict.fromkeys(
+            ("h", "height", "elev", "elevation", "alt", "altitude", "z", "z_coord", "zcoord", "coord_z", "z coordinate"), "z"
+        ),
+    },
+)
+"""What columns are called that hold coordinates; the first set that is complete counts."""
+_FEWEST_COUNTED, _MOST_COUNTED = 20, 4096
 _NEW_FILE_STEP = 1e-9
 _MOST_TITLES = 1000
 _MOST_COLUMNS = 4096
@@ -89,10 +101,11 @@ def matches(head: bytes) -> bool:
 
 
 def read(raw: bytes, origin: str) -> Scan:
-    """A scan of text bytes. Columns are found by the names x, y, z in a header line or comment, else they are the first three.
+    """A scan of text bytes. Columns are found by the names x, y, z, or easting, northing, height and the like, in a header line
+    or comment, else they are the first three.
 
     Other columns become attributes under their header name, else column_4, column_5, … counted from 1.
-    Raises ScanError naming the first line that lacks a coordinate.
+    Raises ScanError naming the first line that lacks a coordinate, and where the first column counts rows.
     """
     if b"\0" in raw[:65536]:
         raise ScanError(f"{origin}: is binary or UTF-16, not text; name its real format or save it as UTF-8")
@@ -126,8 +139,25 @@ def _named(rows: TextRows, layout: _Layout, origin: str) -> tuple[tuple[int, int
     if n_fields > _MOST_COLUMNS:
         raise ScanError(f"{origin}: line {layout.first_row + 1} has {n_fields} columns, more than any scan; is it a point cloud?")
     names = _unique([*layout.names, *(f"column_{i + 1}" for i in range(len(layout.names), n_fields))][:n_fields])
-    found = [_axis(name) for name in names]
-    return (found.index("x"), found.index("y"), found.index("z")) if {"x", "y", "z"} <= set(found) else (0, 1, 2), names
+    for words in _AXES:
+        found = [_axis(name, words) for name in names]
+        if set(words.values()) <= set(found):
+            return (found.index("x"), found.index("y"), found.index("z")), names
+    if n_fields > 3 and _counts(replace(rows, starts=rows.starts[:_MOST_COUNTED], ends=rows.ends[:_MOST_COUNTED])):
+        raise ScanError(
+            f"{origin}: its first column counts the rows, so that nothing says which columns are x, y and z;"
+            " name them in a first line, such as: id x y z"
+        )
+    return (0, 1, 2), names
+
+
+def _counts(rows: TextRows) -> bool:
+    """Whether the first column goes up by one from row to row, in so many rows that it cannot be a coordinate."""
+    try:
+        first = rows.numbers([0])[0]
+    except ScanError:
+        return False
+    return len(first) >= _FEWEST_COUNTED and bool((np.diff(first) == 1).all())
 
 
 class XyzStream:
@@ -293,15 +323,19 @@ def _names(titles: Sequence[tuple[bytes, int]], delimiter: int | None, n_fields:
         for candidate in (delimiter, *_DELIMITERS):
             names = [field.decode("utf-8", "replace") for field in split_fields(line.lstrip(b"#/"), candidate)]
             complete = len(names) == n_fields and not line.startswith(_COMMENTS)
-            if len(names) <= n_fields and (complete or {"x", "y", "z"} <= set(map(_axis, names))):
+            if len(names) <= n_fields and (complete or _names_axes(names)):
                 return names, end
     return [], None
 
 
-def _axis(name: str) -> str:
-    """x, y or z for a column of that name, a unit in brackets behind it or not; else nothing."""
-    match = re.fullmatch(r"([xyz])\s*([\[(].*)?", name.strip().lower())
-    return match[1] if match else ""
+def _names_axes(names: Sequence[str]) -> bool:
+    """Whether all three axes are among the names."""
+    return any(set(words.values()) <= {_axis(name, words) for name in names} for words in _AXES)
+
+
+def _axis(name: str, words: Mapping[str, str]) -> str:
+    """x, y or z for a column that is called by one of the words, a unit in brackets behind it or not; else nothing."""
+    return words.get(re.sub(r"\s*[\[(].*", "", name.strip().lower(), flags=re.DOTALL), "")
 
 
 def _unique(names: Sequence[str]) -> list[str]:
