@@ -192,7 +192,7 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(sphere: Path, capsys: pyte
         (["-o", "c.xyz", "--only-class", "2"], 3, "has no classes"),
         (["-o", "c.abc"], 3, "c.abc: no suffix tells its format"),
         (["-o", "c.bin", "--method", "mean"], 3, "would drop"),
-        (["-o", "c.bin", "--outliers", "flag", "--drop-attributes"], 3, "bin cannot hold outlier, which is asked for"),
+        (["-o", "c.bin", "--outliers", "flag", "--drop-attributes"], 3, "bin cannot hold column outlier, which is asked for"),
         (["-o", "locked.xyz", "--overwrite"], 3, "locked.xyz: is read-only"),
         (["-o", "c.xyz", "--max-move", "inf"], 2, "--max-move: must be a finite number"),
         (["-o", "c.xyz", "--noise", "1e300"], 2, "--noise: must be less than"),

@@ -158,7 +158,7 @@ class Cleaning:
             check_columns(scan, self.config.align_by)
         written = format_of(job.target, self.format) or io.SUFFIXES.get(job.target.suffix.lower())
         lost = io.losses(replace(scan, attributes=added, source=None), written) if written and added else []
-        if unheld := [name for name in added if f"column {name}" in lost]:
+        if unheld := [column for name in added if (column := f"column {name}") in lost]:
             raise ScanError(f"{job.target}: {written} cannot hold {', '.join(unheld)}, which is asked for; write .ply or .las")
         if written and not self.drop_attributes:
             io.refuse_losses(scan.with_attributes(**added), job.target, written)
