@@ -331,7 +331,7 @@ def _summary(figures: Figures) -> str:
         parts.append(f"{figures['points_selected']:,} selected")
     if "aligned_by" in figures:
         off = f"off by {figure(figures['offset'])}" if figures["offset"] else "which agree"
-        parts.append(f"{counted(figures['groups'], 'group')} by {figures['aligned_by']} {off}")
+        parts.append(f"{figures['groups']:,} groups by {figures['aligned_by']} {off}" if figures["groups"] > 1 else "one group")
     parts.append(f"noise {figure(figures['noise'])}" if figures["is_surface"] else "no surface to clean")
     parts.append(f"moved {figure(figures['move_median'])} (median), at most {figure(figures['move_max'])}")
     if figures["points_left_alone"]:
