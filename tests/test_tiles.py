@@ -75,10 +75,41 @@ def test_cells_give_what_the_whole_gives(name: str, tmp_path: Path) -> None:
         assert job.figures[figure] == whole.figures[figure]
     assert job.figures.get("outliers") == whole.figures.get("outliers")
     assert ("outliers" in whole.figures) == (config.outliers == "flag")
-    assert job.figures["noise"] == pytest.approx(whole.figures["noise"], rel=1e-6)
+    assert job.figures["noise"] == pytest.approx(whole.figures["noise"], rel=1e-9)
+    assert job.figures["move_median"] == pytest.approx(whole.figures["move_median"], rel=1e-3)
     assert bool(job.figures["std"]) == config.uncertainty
     if whole.std is not None:
         np.testing.assert_allclose(np.concatenate(job.figures["std"]), whole.std, atol=2e-3 * whole.figures["noise"])
+
+
+def odd(name: str) -> np.ndarray:
+    """(N, 3) points of which many are equally far from one, or are in the file many times, or fill a cell by themselves."""
+    noisy = cloud("torus", 6000, 1.0)
+    if name == "rounded to a quarter of the noise":
+        step = noisy.spacing / 4
+        return np.unique(np.round(noisy.noisy / step) * step, axis=0)
+    if name == "every point eight times":
+        return np.repeat(noisy.noisy, 8, axis=0)
+    if name == "ten places":
+        return np.repeat(np.random.default_rng(0).random((10, 3)), 300, axis=0)
+    return np.concatenate([noisy.noisy, np.ones((2, 3)) + [[0, 0, 0], [0, 0, 1e-16]]])
+
+
+@pytest.mark.parametrize(
+    "name", ["rounded to a quarter of the noise", "every point eight times", "ten places", "a last chunk of one place"]
+)
+def test_cells_give_what_the_whole_gives_of_odd_clouds(name: str, tmp_path: Path) -> None:
+    points, config = odd(name), DenoiseConfig(threads=1)
+    whole = denoiser.denoise(points, model("seeded"), config)
+    job = Tiles(
+        tmp_path / "cells", lambda: np.split(points, [len(points) // 2, len(points) - 2]), model("seeded"), config, 1500, {}
+    )
+    job.run()
+    moved = np.concatenate([rows.points for rows in job.rows()])
+    np.testing.assert_allclose(moved, whole.points, atol=1e-3 * max(whole.figures["noise"], 1e-9))
+    for figure in ("noise", "move_median", "move_p99"):
+        assert job.figures[figure] == pytest.approx(whole.figures[figure], rel=1e-3, abs=1e-12)
+    assert job.figures["points_left_alone"] == whole.figures["points_left_alone"]
 
 
 def test_a_rim_is_needed_for_that(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -94,6 +125,20 @@ def test_few_points_and_no_points(few: int, tmp_path: Path, rng: np.random.Gener
     points = rng.random((few, 3))
     moved, _ = cleaned_in_cells(points, tmp_path / "cells", DenoiseConfig(threads=1), 1000)
     np.testing.assert_allclose(moved, denoiser.denoise(points, model("seeded"), DenoiseConfig(threads=1)).points, atol=1e-12)
+
+
+def test_passes_that_are_over_are_not_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    points, config = cloud("torus", 3000, 0.5).noisy, DenoiseConfig(threads=1, iters=4)
+    moved, job = cleaned_in_cells(points, tmp_path, config, 1000)
+    (tmp_path / "pass_4.json").unlink()
+    (tmp_path / "pass_4" / "0.f64").unlink()
+    made: list[int] = []
+    clean = Tiles.clean
+    monkeypatch.setattr(Tiles, "clean", lambda self, cell, number, level: (made.append(number), clean(self, cell, number, level)))
+    again, _ = cleaned_in_cells(points, tmp_path, config, 1000)
+    assert again.tobytes() == moved.tobytes()
+    assert sorted(set(made)) == [3, 4]
+    job.remove()
 
 
 def test_what_is_done_is_not_done_again_and_another_job_starts_anew(tmp_path: Path) -> None:

@@ -32,19 +32,37 @@ _QUERIES = 1 << 12  # answered in a row by one thread
 _BITS = 21  # per axis: three axes fill 63 bits of one Morton code
 
 
-def spatial_order(points: Points) -> Indices:
+def spatial_order(points: Points, frame: tuple[Points, float] | None = None) -> Indices:
     """(N,) permutation of (N, 3) finite points along a Morton curve, so that near points are near in memory.
 
-    A k-d tree over points in this order is built and queried three to four times faster than over random order.
+    A k-d tree over points in this order is built and queried three to four times faster than over random order, and of
+    neighbours that are equally near the first counts. frame: lowest corner (3,) and extent of the cube that the curve fills,
+    their own if not given: a part of a cloud lies in the order of the whole if it is in the frame of the whole.
     """
     if len(points) == 0:
         return np.zeros(0, dtype=np.int64)
-    low = points.min(axis=0)
-    extent = float((points.max(axis=0) - low).max())
-    cells = ((points - low) / (extent or 1.0) * (2**_BITS - 1)).astype(np.uint64)
+    low, extent = frame or frame_of(points)
+    cells = np.clip((points - low) / (extent or 1.0) * (2**_BITS - 1), 0, 2**_BITS - 1).astype(np.uint64)
     code = _spread_bits(cells[:, 0]) << np.uint64(2) | _spread_bits(cells[:, 1]) << np.uint64(1) | _spread_bits(cells[:, 2])
     order: Indices = np.argsort(code, kind="stable")
     return order
+
+
+def frame_of(points: Points) -> tuple[Points, float]:
+    """The lowest corner (3,) of (N, 3) points, N >= 1, and their largest extent."""
+    low = points.min(axis=0)
+    return low, float((points.max(axis=0) - low).max())
+
+
+def nearest_to(centre: Points, points: Points, identity: Identity, most: int) -> Indices:
+    """Rows, ascending, of so many of (N, 3) points nearest to a place; of those equally far, the ones of least identity (N,)."""
+    if most >= len(points):
+        return np.arange(len(points))
+    squared = ((points - centre) ** 2).sum(axis=1)
+    furthest = np.partition(squared, most - 1)[most - 1]
+    inside, rim = np.flatnonzero(squared < furthest), np.flatnonzero(squared == furthest)
+    rim = rim[np.argsort(identity[rim], kind="stable")[: most - len(inside)]]
+    return np.sort(np.concatenate([inside, rim]))
 
 
 def _spread_bits(value: NDArray[np.uint64]) -> NDArray[np.uint64]:

@@ -83,7 +83,7 @@ class NoiseLevel:
     @property
     def as_read(self) -> NoiseLevel:
         """The level by what neighbours disagree by alone."""
-        return self.times(1 / self.times_read)
+        return replace(self.times(1 / self.times_read), times_read=1.0)
 
 
 def estimate(points: Points, seed: int = 0, threads: int = -1, known_std: float | None = None) -> NoiseLevel:

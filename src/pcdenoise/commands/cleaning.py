@@ -198,6 +198,9 @@ class Cleaning:
 
         started = time.perf_counter()
         self._refuse_cells(job, stream)
+        if self.config.align_by is None and self.model and self.model.config.align_by:
+            names = ",".join(self.model.config.align_by)
+            self.console.note(f"{job.source}: not aligned by {names} as the model asks: cleaned in cells")
         cell_points = self.tile or points_per_cell(self.max_bytes)
         job.target.parent.mkdir(parents=True, exist_ok=True)
         folder = cells_of(job)

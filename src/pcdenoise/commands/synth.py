@@ -45,7 +45,7 @@ def synth(
     seed: options.Seed = 0,
     quiet: options.Quiet = False,
 ) -> None:
-    """Make a data set: of each surface an evenly spaced clean cloud with colours, a noisy cloud per level, and its mesh, if any.
+    """Make a data set: of each surface a clean cloud with colours, evenly spaced, a noisy one per level, and its mesh.
 
     Example: pcdenoise synth meshes/ shapes:20 -o data/ --points 20000 --levels 1,2
     """

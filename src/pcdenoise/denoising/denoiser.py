@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdenoise.cloud import drift
-from pcdenoise.cloud.neighbours import Identity, coordinate_hash, distinct_by, drawn_by, spatial_order
+from pcdenoise.cloud.neighbours import Identity, coordinate_hash, distinct_by, drawn_by, nearest_to, spatial_order
 from pcdenoise.cloud.noise_level import NoiseLevel, by_place, estimate_at, probes
 from pcdenoise.cloud.scan import Mask, Points, check_extent, within
 from pcdenoise.config import DenoiseConfig
@@ -93,7 +93,7 @@ def denoise(
     steps = list(_passes(cloud, model, config, on_progress or (lambda _task, _share: None)))
     moved = steps[-1].points if steps else cloud.start
     unmoved = cloud.unmoved(moved)
-    length = np.linalg.norm(moved - cloud.start, axis=1) if len(moved) else np.zeros(1)
+    length = cloud.to_rows(np.linalg.norm(moved - cloud.start, axis=1), np.nan)[cloud.finite] if len(moved) else np.zeros(1)
     drifted = drift.measure(cloud.start, moved, config.seed, cloud.threads)
     figures = {
         "noise": cloud.level.std,
@@ -183,11 +183,12 @@ class _Cloud:
         identity = coordinate_hash(usable, 0)
         first, place = distinct_by(identity)
         self.origin = origin_of(usable[first[:N_CENTRAL]])  # `distinct_by` sorts by the hash, so these are drawn by it
-        order = spatial_order(usable[first])
+        distinct = usable[first] - self.origin
+        order = spatial_order(distinct)
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
         self._first, self._row = np.flatnonzero(self.finite)[first[order]], back[place]
-        self.start: Points = points[self._first] - self.origin
+        self.start: Points = distinct[order]
         self.aligned: Points = self.start if shift is None else self.start + self.of_rows(shift)
         self.reached = self.aligned
         self.identity: Identity = identity[first][order]
@@ -204,10 +205,7 @@ class _Cloud:
         return taken_off.level_by(read, centres, self._around, model, self.config.seed, self.threads)
 
     def _around(self, centre: Points, most: int) -> taken_off.Sample:
-        if most >= len(self.aligned):
-            return self.aligned, self.identity
-        distance = ((self.aligned - centre) ** 2).sum(axis=1)
-        rows = np.sort(np.argpartition(distance, most)[:most])
+        rows = nearest_to(centre, self.aligned, self.identity, most)
         return self.aligned[rows], self.identity[rows]
 
     def of_rows(self, values: NDArray[Any]) -> NDArray[Any]:
@@ -307,7 +305,7 @@ def _passes(
         length = np.linalg.norm(moved - points, axis=1)
         figures = {
             "iteration": number,
-            "roughness_before": level.std,
+            "roughness_before": level.as_read.std,
             "roughness_after": after.std,
             "move_median": float(np.median(length)),
             "move_max": float(length.max()),

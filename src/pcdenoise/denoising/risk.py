@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdenoise.cloud.blocks import each_block
-from pcdenoise.cloud.neighbours import Identity, NeighbourSearch, drawn_by, principal_axes
+from pcdenoise.cloud.neighbours import Identity, NeighbourSearch, drawn_by, nearest_to, principal_axes
 from pcdenoise.cloud.noise_level import NoiseLevel
 from pcdenoise.cloud.scan import Points
 
@@ -50,8 +50,7 @@ class Risk:
 
     def __init__(self, points: Points, identity: Identity, level: NoiseLevel, seed: int, threads: int) -> None:
         if len(points) > MOST_POINTS:
-            distance = np.linalg.norm(points - points[drawn_by(identity, seed).argmin()], axis=1)
-            nearest = np.sort(np.argpartition(distance, MOST_POINTS)[:MOST_POINTS])
+            nearest = nearest_to(points[drawn_by(identity, seed).argmin()], points, identity, MOST_POINTS)
             points, identity = points[nearest], identity[nearest]
         self.points, self.identity = points, identity
         self._start, self._threads = points, threads

@@ -32,7 +32,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdenoise.cloud import drift
-from pcdenoise.cloud.neighbours import Distances, Identity, NeighbourSearch, coordinate_hash, distinct_by, drawn_by, spatial_order
+from pcdenoise.cloud.neighbours import (
+    Distances,
+    Identity,
+    NeighbourSearch,
+    coordinate_hash,
+    distinct_by,
+    drawn_by,
+    nearest_to,
+    spatial_order,
+)
 from pcdenoise.cloud.noise_level import N_PROBES, NoiseLevel, by_place, estimate_from
 from pcdenoise.cloud.scan import Mask, Points, check_extent
 from pcdenoise.config import DenoiseConfig
@@ -100,8 +109,8 @@ class _Smallest:
         self.n, self.keys, self.points = n, np.empty(0, np.uint64), np.empty((0, 3))
 
     def add(self, keys: Identity, points: Points) -> None:
-        if len(keys) > self.n:
-            few = np.argpartition(keys, self.n)[: 4 * self.n]
+        if len(self.keys) == self.n:
+            few = keys < self.keys[-1]
             keys, points = keys[few], points[few]
         keys, points = np.concatenate([self.keys, keys]), np.concatenate([self.points, points])
         keys, rows = np.unique(keys, return_index=True)
@@ -149,8 +158,9 @@ class Tiles:
             central.add(identity, usable)
             probed.add(drawn_by(identity, self.config.seed), usable)
             n_rows, n_finite = n_rows + len(chunk), n_finite + len(usable)
-            check_extent(usable)
             low, high = np.minimum(low, usable.min(axis=0, initial=np.inf)), np.maximum(high, usable.max(axis=0, initial=-np.inf))
+        if n_finite:
+            check_extent(np.stack([low, high]))
         origin = denoiser.origin_of(central.points)
         cuts = _cuts(central.points - origin, max(1, -(-n_finite // self.cell_points)))
         plan: dict[str, Any] = {
@@ -162,7 +172,8 @@ class Tiles:
             "cuts": cuts,
         }
         plan |= {"n_cells": _n_cells(cuts), "probes": (probed.points - origin).tolist(), "probe_keys": probed.keys.tolist()}
-        plan["diagonal"] = float(np.linalg.norm((high - origin) - (low - origin))) if n_finite else 0.0
+        low, high = (low - origin, high - origin) if n_finite else (np.zeros(3), np.zeros(3))
+        plan |= {"diagonal": float(np.linalg.norm(high - low)), "low": low.tolist(), "extent": float((high - low).max())}
         for chunk in self.chunks():
             usable = chunk[np.isfinite(chunk).all(axis=1)]
             rows = np.empty((len(usable), 4))
@@ -178,7 +189,11 @@ class Tiles:
         """The plan that a file holds, if it is one of this job and of cells that fit in memory now."""
         try:
             plan: dict[str, Any] = json.loads(said)
-            same = plan["job"] == json.loads(json.dumps(self.job)) and plan["cell_points"] <= _LARGER_CELLS * self.cell_points
+            same = (
+                "extent" in plan
+                and plan["job"] == json.loads(json.dumps(self.job))
+                and plan["cell_points"] <= _LARGER_CELLS * self.cell_points
+            )
         except (ValueError, KeyError, TypeError):
             return None
         return plan if same else None
@@ -203,11 +218,11 @@ class Tiles:
             judgement = judge.figures(level) if judge is not None else {}
             if judgement is None:
                 break
-            for cell in self.cells:
+            for cell in [] if self._is_over(number) else self.cells:
                 self.clean(cell, number, level)
                 on_progress(task, (cell + 1) / len(self.cells))
             after = self.level(number)
-            roughness = {"roughness_before": level.std, "roughness_after": after.std}
+            roughness = {"roughness_before": level.as_read.std, "roughness_after": after.std}
             self.steps.append({"iteration": number, **roughness, **judgement})
             if number > 2:
                 shutil.rmtree(self.folder / f"pass_{number - 2}", ignore_errors=True)
@@ -228,6 +243,10 @@ class Tiles:
             "points_coincident": self.plan["n_finite"] - self.plan["n_distinct"],
             "cells": len(self.cells),
         }
+
+    def _is_over(self, number: int) -> bool:
+        """Whether a pass was made before, and removed once others had been made after it."""
+        return (self.folder / f"pass_{number}.json").is_file() and not (self.folder / f"pass_{number}").is_dir()
 
     def rows(self) -> Iterator[Rows]:
         """Every chunk's rows at their new places, in file order; completes the figures. Needs `run` before."""
@@ -313,15 +332,20 @@ class Tiles:
         low, high = centres.min(axis=0), centres.max(axis=0)
         own = self._part(cell, number).points
         margin = 1.5 * float(NeighbourSearch(own, self.threads).knn(centres, min(k, len(own)))[0].max())
+        margin = max(margin, 1e-3 * self.plan["extent"], np.finfo(np.float64).tiny)
         while True:
             near = np.concatenate([own, *(part.points for part in self._rim(cell, number, low - margin, high + margin))])
             if len(near) >= k:
-                near = near[spatial_order(near)]
+                near = near[self._order(near)]
                 distances, indices = NeighbourSearch(near, self.threads).knn(centres, k)
                 if distances.max() <= margin or len(near) == self.plan["n_distinct"]:
                     return distances, near[indices]
                 margin = max(1.01 * float(distances.max()), margin)
             margin *= 2
+
+    def _order(self, points: Points) -> NDArray[np.int64]:
+        """(N,) the order in which the whole cloud has these points."""
+        return spatial_order(points, (np.array(self.plan["low"]), self.plan["extent"]))
 
     def _judge(self, level: NoiseLevel) -> denoiser.Judge:
         """The points that stand for the whole cloud: those nearest to the first of all probes, as in memory."""
@@ -332,8 +356,8 @@ class Tiles:
     def _around(self, centre: Points, most: int) -> taken_off.Sample:
         """So many points nearest to a place, as they are in the file."""
         most = min(most, self.plan["n_distinct"])
-        part = self._part(int(_cell_of(centre[None], self.plan["cuts"])[0]), 0)
         cell = int(_cell_of(centre[None], self.plan["cuts"])[0])
+        part = self._part(cell, 0)
         margin = max(float(np.ptp(part.points, axis=0).max()), 1e-12)
         while True:
             tile = _joined([part, *self._rim(cell, 0, centre - margin, centre + margin)])
@@ -341,10 +365,9 @@ class Tiles:
             if len(tile.points) == self.plan["n_distinct"] or (distance <= margin).sum() >= most:
                 break
             margin *= 1.5
-        if most < len(tile.points):
-            nearest = np.argpartition(distance, most)[:most]
-            tile = _Part(tile.points[nearest], tile.identity[nearest])
-        order = spatial_order(tile.points)
+        nearest = nearest_to(centre, tile.points, tile.identity, most)
+        tile = _Part(tile.points[nearest], tile.identity[nearest])
+        order = self._order(tile.points)
         return tile.points[order], tile.identity[order]
 
     def _drift(self, cell: int, number: int) -> tuple[int, float, float]:
@@ -364,7 +387,7 @@ class Tiles:
         if path.is_file():
             return
         own, tile = self._tile(cell, number - 1)
-        order = spatial_order(tile.points)
+        order = self._order(tile.points)
         moved = denoiser.one_pass(
             tile.points[order], tile.identity[order], level, self.plan["diagonal"], self.model, self.config, self.threads
         )
@@ -377,7 +400,7 @@ class Tiles:
         path = self.folder / "outliers" / f"{cell}.u1"
         if not path.is_file():
             own, tile = self._tile(cell, 0)
-            order = spatial_order(tile.points)
+            order = self._order(tile.points)
             found = np.zeros(len(order), bool)
             found[order] = outliers.find(tile.points[order], level=level, threads=self.threads)
             _write(path, found[: len(own.points)].tobytes())
@@ -391,9 +414,9 @@ class Tiles:
         std = np.full(len(own.points), np.nan)
         if level.is_surface:
             measured, around = self._tile(cell, 0)
-            order, noise = spatial_order(around.points), np.empty(len(around.points))
+            order, noise = self._order(around.points), np.empty(len(around.points))
             noise[order] = by_place(around.points[order], around.identity[order], level, self.threads)
-            start, cleaned = measured.points, tile.points[spatial_order(tile.points)]
+            start, cleaned = measured.points, tile.points[self._order(tile.points)]
             final = start if number == 0 else denoiser.limited(start, own.points, self.config)
             std = uncertainty.estimate(cleaned, start, own.points, final, noise[: len(start)], self.threads)
         _write(path, std.tobytes())
@@ -404,7 +427,7 @@ class Tiles:
         if not len(own.points):
             return own, own
         low, high = own.points.min(axis=0), own.points.max(axis=0)
-        ordered = own.points[spatial_order(own.points)]
+        ordered = own.points[self._order(own.points)]
         level = self.level(number)
         k = min(len(ordered), 1 + self._neighbours(level))
         some = ordered[:: max(1, len(ordered) // _SAMPLED)]
