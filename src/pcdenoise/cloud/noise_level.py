@@ -156,6 +156,8 @@ def around(points: Points, level: NoiseLevel, at: Points | None = None, seed: in
 
     The map to the one number of `estimate`; NaN where no surface shows.
     """
+    if level.times_read != 1:
+        return level.times_read * around(points, level.as_read, at, seed, threads)
     at = points if at is None else at
     cloud = points[distinct(points)[0]]
     cloud = cloud[spatial_order(cloud)]

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from pcdenoise.cloud.scan import Mask, Points, Scan
     from pcdenoise.config import DenoiseConfig
-    from pcdenoise.denoising.denoiser import Result
+    from pcdenoise.denoising.denoiser import Progress, Result
     from pcdenoise.evaluation.report import Page
     from pcdenoise.io import Stream
     from pcdenoise.networks.store import Model
@@ -245,9 +245,8 @@ class Cleaning:
         scan = io.read(job.source, format=format_of(job.source, self.format))
         self._refuse(job, scan)
         with self.console.progress(job.source.name) as on_progress:
-            on_progress("aligning", 0.0)
             movable, seen = self.selection.masks(scan)
-            shift, aligned = self._shift(job, scan, seen)
+            shift, aligned = self._shift(job, scan, seen, on_progress)
             if self.selection == selection.Selection():
                 result = denoiser.denoise(scan.points, self.model, self.config, on_progress, shift=shift)
             else:
@@ -277,7 +276,7 @@ class Cleaning:
         self.console.note(f"{job.target}: {_summary(figures)}" + (f"; picture {picture}" if picture else ""))
         return figures
 
-    def _shift(self, job: Job, scan: Scan, seen: Mask) -> tuple[Points | None, Figures]:
+    def _shift(self, job: Job, scan: Scan, seen: Mask, on_progress: Progress) -> tuple[Points | None, Figures]:
         """(N, 3) by how much rows are moved so that groups of them meet, if they are to be aligned, and figures of that."""
         import numpy as np
 
@@ -290,6 +289,7 @@ class Cleaning:
             if self.config.align_by is None and of_model:
                 self.console.note(f"{job.source}: not aligned by {','.join(of_model)} as the model asks: no such columns")
             return None, {}
+        on_progress("aligning", 0.0)
         groups, shift = groups_of(scan, names), np.zeros((len(scan), 3))
         shift[seen], figures = denoiser.shift_of(scan.points[seen], groups[seen], self.model, self.config)
         rows, sizes = np.unique(groups, return_index=True, return_counts=True)[1:]

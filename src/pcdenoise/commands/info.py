@@ -83,10 +83,11 @@ def _noise_of_rows(scan: Scan, seed: int, threads: int) -> NDArray[np.float64]:
     import numpy as np
 
     from pcdenoise.cloud import noise_level
+    from pcdenoise.commands.survey import noise_of
 
     points = scan.points[scan.finite]
     values = np.full(len(scan), np.nan)
-    level = noise_level.estimate(points, seed=seed, threads=threads)
+    level = noise_of(points, seed, threads)
     values[scan.finite] = noise_level.around(points, level, seed=seed, threads=threads)
     return values
 

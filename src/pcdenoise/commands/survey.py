@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from pcdenoise.commands.files import attachments
 
 if TYPE_CHECKING:
+    from pcdenoise.cloud.noise_level import NoiseLevel
     from pcdenoise.cloud.scan import Points, Scan
     from pcdenoise.io.crs import Crs
 
@@ -38,7 +39,7 @@ def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
     """Facts of a scan in its own unit, JSON-ready: counts, extent, density, noise and its spread, system, warnings, cost.
 
     density          points per square unit of surface.
-    noise            std along the normal; noise_p5 and noise_p95 are what 5 % of the places lie below and above.
+    noise            std along the normal, as the default model would clean by; noise_p5 and noise_p95 are what 5 % of the places lie below and above.
     surface_share    of the points around which a surface shows.
     outlier_share    of points that are no sample of any surface, from up to 200 000 points.
     """
@@ -72,7 +73,7 @@ def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
     if len(places) < 2:
         return found | {"warnings": traps(scan, None)}
     places = places[spatial_order(places)]
-    level = noise_level.estimate(points, seed=seed, threads=threads)
+    level = noise_of(points, seed, threads)
     probes = places[np.sort(np.random.default_rng(seed).choice(len(places), min(noise_level.N_PROBES, len(places)), False))]
     k = min(N_NEIGHBOURS, len(places))
     radius = float(np.median(NeighbourSearch(places, threads).knn(probes, k)[0][:, -1]))
@@ -97,6 +98,16 @@ def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
     if found["outlier_share"] > _MANY_OUTLIERS:
         said.append("many points belong to no surface; --outliers flag marks them, --outliers remove leaves them out")
     return found | {"warnings": said}
+
+
+def noise_of(points: Points, seed: int, threads: int) -> NoiseLevel:
+    """The noise of (N, 3) finite points, as the default model would clean them by."""
+    from pcdenoise.config import DenoiseConfig
+    from pcdenoise.denoising.denoiser import level_of
+    from pcdenoise.networks import store
+
+    config = DenoiseConfig.model_validate({"seed": seed, "threads": threads if threads > 0 else None})
+    return level_of(points, store.load(), config)
 
 
 def cost(n_points: int, n_passes: float = 1, n_draws: int = 1) -> dict[str, float]:
