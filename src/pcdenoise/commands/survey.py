@@ -39,7 +39,8 @@ def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
     """Facts of a scan in its own unit, JSON-ready: counts, extent, density, noise and its spread, system, warnings, cost.
 
     density          points per square unit of surface.
-    noise            std along the normal, as the default model would clean by; noise_p5 and noise_p95 are what 5 % of the places lie below and above.
+    noise            std along the normal, as the default model would clean by; 5 % of the places lie below noise_p5, 5 % above
+                     noise_p95.
     surface_share    of the points around which a surface shows.
     outlier_share    of points that are no sample of any surface, from up to 200 000 points.
     """
