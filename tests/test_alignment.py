@@ -164,7 +164,7 @@ def test_a_model_that_was_adapted_says_by_which_columns(
     assert "groups" not in capsys.readouterr().err
     pcdenoise.write(Scan(scan.points, format="ply"), path, overwrite=True)
     assert main(["denoise", str(path), "-o", str(out), "--model", str(adapted), "--overwrite"]) == 0
-    assert "not aligned by beam as the model asks: no such columns" in capsys.readouterr().err
+    assert "has no column beam to align by; its columns: none; cleaned as it is" in capsys.readouterr().err
 
 
 def test_a_column_is_learned_only_where_its_groups_are_off(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from pcdenoise.cloud.scan import Scan
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import denoiser
-from pcdenoise.denoising.alignment import columns_to_align_by, groups_of
+from pcdenoise.denoising.alignment import groups_asked_for
 from pcdenoise.denoising.denoiser import Progress, Result
 from pcdenoise.errors import UsageError
 from pcdenoise.networks import store
@@ -44,8 +44,9 @@ def denoise(
         if chosen.align_by:
             raise UsageError("align_by: names columns, which an array has not; give a Scan")
         return denoiser.denoise(rows, loaded, chosen, on_progress)
-    names = columns_to_align_by(points, chosen.align_by, loaded.config.align_by if loaded else ())
-    shift = denoiser.shift_of(rows, groups_of(points, names), loaded, chosen)[0] if names else None
+    of_model = loaded.config.align_by if loaded else ()
+    groups = groups_asked_for(points, chosen.align_by, of_model, lambda _fault: None)[1]
+    shift = None if groups is None else denoiser.shift_of(rows, groups, loaded, chosen)[0]
     return denoiser.denoise(rows, loaded, chosen, on_progress, shift=shift)
 
 

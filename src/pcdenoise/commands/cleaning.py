@@ -9,7 +9,7 @@ import os
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -281,16 +281,15 @@ class Cleaning:
         import numpy as np
 
         from pcdenoise.denoising import denoiser
-        from pcdenoise.denoising.alignment import columns_to_align_by, groups_of
+        from pcdenoise.denoising.alignment import groups_asked_for
 
         of_model = self.model.config.align_by if self.model else ()
-        names = columns_to_align_by(scan, self.config.align_by, of_model)
-        if not names:
-            if self.config.align_by is None and of_model:
-                self.console.note(f"{job.source}: not aligned by {','.join(of_model)} as the model asks: no such columns")
+        on_fault = partial(_note_as_it_is, self.console)
+        names, groups = groups_asked_for(scan, self.config.align_by, of_model, on_fault)
+        if groups is None:
             return None, {}
         on_progress("aligning", 0.0)
-        groups, shift = groups_of(scan, names), np.zeros((len(scan), 3))
+        shift = np.zeros((len(scan), 3))
         shift[seen], figures = denoiser.shift_of(scan.points[seen], groups[seen], self.model, self.config)
         rows, sizes = np.unique(groups, return_index=True, return_counts=True)[1:]
         for row, n in zip(rows[:_MOST_GROUPS], sizes, strict=False):
@@ -317,6 +316,10 @@ class Cleaning:
         if std is not None:
             cleaned = with_uncertainty(cleaned, std)
         return with_outliers(cleaned, outlier) if self.config.outliers == "flag" else cleaned
+
+
+def _note_as_it_is(console: Console, fault: str) -> None:
+    console.note(f"{fault}; cleaned as it is")
 
 
 def picture_notes(result: Result, unit: str) -> tuple[str, str]:

@@ -32,8 +32,6 @@ _TILT = 0.01
 """Mean square of the angle, in radians, by which normals are off: a plane must not tell offsets within itself."""
 _FLOOR = 0.1
 """Of the median variance: no place counts as if it were known better than that."""
-
-
 _FEWEST_POINTS = 8
 """On average of a group: a column with more values than that allows says when a point was measured, not by what."""
 
@@ -43,13 +41,6 @@ def check_columns(scan: Scan, names: Sequence[str]) -> None:
     if missing := [name for name in names if name not in scan.attributes]:
         there = ", ".join(scan.attributes) or "none"
         raise ScanError(f"{scan.origin}: has no column {missing[0]} to align by; its columns: {there}")
-
-
-def columns_to_align_by(scan: Scan, asked: Sequence[str] | None, of_model: Sequence[str]) -> tuple[str, ...]:
-    """What is asked for; where nothing is said, what the model was adapted to, if the scan has all of it."""
-    if asked is not None:
-        return tuple(asked)
-    return tuple(of_model) if all(name in scan.attributes for name in of_model) else ()
 
 
 def groups_of(scan: Scan, names: Sequence[str]) -> Groups:
@@ -66,6 +57,23 @@ def groups_of(scan: Scan, names: Sequence[str]) -> Groups:
             " align by columns that many points share"
         )
     return groups
+
+
+def groups_asked_for(
+    scan: Scan, asked: Sequence[str] | None, of_model: Sequence[str], on_fault: Callable[[str], None]
+) -> tuple[Sequence[str], Groups | None]:
+    """The columns to align by and the groups that they make: those asked for, or else what the model was adapted to.
+
+    A scan need not have what a model names: then `on_fault` hears why there are no groups. Raises ScanError for what is asked.
+    """
+    names = of_model if asked is None else asked
+    try:
+        return names, groups_of(scan, names) if names else None
+    except ScanError as fault:
+        if asked is not None:
+            raise
+        on_fault(str(fault))
+        return names, None
 
 
 @dataclass(frozen=True)
