@@ -89,6 +89,17 @@ def test_the_order_of_rows_and_the_numbers_of_groups_do_not_matter() -> None:
     assert np.abs(there[order] - back).max() < 1e-6 * sample.spacing
 
 
+def test_a_group_may_be_of_rows_that_coincide_with_others_or_are_not_finite() -> None:
+    sample, points, group, _ = off_by_group("sphere", 2.0)
+    more = np.concatenate([points, points[:5], np.full((2, 3), np.nan)])
+    groups = np.concatenate([group, np.repeat([N_GROUPS, N_GROUPS + 1], [5, 2])])
+    shift, figures = shift_of(more, groups, store.load(), CONFIG)
+    assert figures["groups"] == N_GROUPS + 2
+    assert np.abs(shift[:N] - shift_of(points, group, store.load(), CONFIG)[0]).max() < 1e-9 * sample.spacing
+    cleaned = denoise(more, store.load(), CONFIG, shift=shift).points
+    assert np.array_equal(cleaned[N : N + 5], cleaned[:5])
+
+
 def test_limits_count_from_where_points_were_measured() -> None:
     sample, points, group, _ = off_by_group("sphere", 2.0)
     shift = shift_of(points, group, store.load(), CONFIG)[0]

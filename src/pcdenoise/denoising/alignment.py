@@ -86,6 +86,14 @@ class Alignment:
     shift: Points
     gain: float
 
+    @classmethod
+    def none(cls, group: Groups) -> Alignment:
+        """No shift of any of the groups (N,)."""
+        return cls(np.zeros((int(group.max(initial=0)) + 1, 3)), 0.0)
+
+    def __len__(self) -> int:
+        return len(self.shift)
+
 
 @dataclass(frozen=True)
 class Heights:
@@ -120,21 +128,18 @@ def heights(points: Points, cleaned: Points, threads: int) -> Heights:
 
 
 def align(
-    points: Points, group: Groups, one_pass: Callable[[Points], Points], threads: int, first: Heights | None = None
+    points: Points, group: Groups, unmoved: Alignment, first: Heights, one_pass: Callable[[Points], Points], threads: int
 ) -> Alignment:
     """The shifts of groups (N,) that leave the least of what cleaning takes off (N, 3) distinct points in spatial order.
 
-    one_pass: cleans them, the same way at every turn. first: the heights without any shift, if they are known.
+    unmoved: no shift, of every group there is; one may be without points. first: the heights then. one_pass: cleans points,
+    the same way at every turn.
     Least squares of height over normal (point to plane), group by group and turn by turn; the offsets' own variance, which
     the heights show, holds back those that are hardly known (empirical Bayes), and points count by how well their
     surroundings agree.
     """
-    n_groups = int(group.max(initial=0)) + 1
-    shift, freedom, best, gain = np.zeros((n_groups, 3)), 0.0, np.inf, 0.0
-    found = Alignment(shift, gain)
-    if n_groups < 2:
-        return found
-    first = first or heights(points, one_pass(points), threads)
+    found, n_groups = unmoved, len(unmoved)
+    shift, freedom, best, gain = unmoved.shift, 0.0, np.inf, 0.0
     local = (first.height[first.near] ** 2).mean(axis=1)
     local += max(_FLOOR * float(np.median(local)), np.finfo(np.float64).tiny)
     size = np.bincount(group, minlength=n_groups)

@@ -20,7 +20,7 @@ from pcdenoise.cloud.noise_level import NoiseLevel, by_place, estimate_at, probe
 from pcdenoise.cloud.scan import Mask, Points, check_extent, within
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import classical, network_pass, outliers, taken_off, uncertainty
-from pcdenoise.denoising.alignment import Alignment, Groups, Heights, align, heights
+from pcdenoise.denoising.alignment import Alignment, Groups, align, heights
 from pcdenoise.denoising.relaxation import relax, without_low_frequencies
 from pcdenoise.denoising.risk import Risk
 from pcdenoise.errors import UsageError
@@ -133,17 +133,20 @@ def alignment_of(points: Points, groupings: list[Groups], model: Model | None, c
 
     Of rows that coincide the first one counts. No group is moved where there is nothing to clean or no surface.
     """
+    unmoved = [Alignment.none(groups) for groups in groupings]
+    if all(len(alignment) < 2 for alignment in unmoved):
+        return unmoved
     cloud = _Cloud(points, model, config)
-    distinct = [cloud.of_rows(groups) for groups in groupings]
     if not most_passes(len(cloud.start), cloud.level, config):
-        return [Alignment(np.zeros((int(groups.max(initial=0)) + 1, 3)), 0.0) for groups in groupings]
+        return unmoved
     plain = config.model_copy(update={"relax_steps": 0})
 
     def cleaned(points: Points) -> Points:
         return one_pass(points, cloud.identity, cloud.level, cloud.diagonal, model, plain, cloud.threads)
 
-    first: Heights = heights(cloud.start, cleaned(cloud.start), cloud.threads)
-    return [align(cloud.start, groups, cleaned, cloud.threads, first) for groups in distinct]
+    first = heights(cloud.start, cleaned(cloud.start), cloud.threads)
+    pairs = zip(groupings, unmoved, strict=True)
+    return [align(cloud.start, cloud.of_rows(groups), none, first, cleaned, cloud.threads) for groups, none in pairs]
 
 
 def shift_of(points: Points, group: Groups, model: Model | None, config: DenoiseConfig) -> tuple[Points, dict[str, float]]:
@@ -151,7 +154,7 @@ def shift_of(points: Points, group: Groups, model: Model | None, config: Denoise
     alignment = alignment_of(points, [group], model, config)[0]
     shift = alignment.shift[group]
     offset = float(np.sqrt((shift**2).sum(axis=1).mean())) if len(shift) else 0.0
-    return shift, {"groups": len(alignment.shift), "offset": offset}
+    return shift, {"groups": len(alignment), "offset": offset}
 
 
 def iterate(points: Points, model: Model | None, config: DenoiseConfig) -> Iterator[Step]:
