@@ -92,7 +92,7 @@ def odd(name: str) -> np.ndarray:
         return np.repeat(noisy.noisy, 8, axis=0)
     if name == "ten places":
         return np.repeat(np.random.default_rng(0).random((10, 3)), 300, axis=0)
-    return np.concatenate([noisy.noisy, np.ones((2, 3)) + [[0, 0, 0], [0, 0, 1e-16]]])
+    return np.concatenate([noisy.noisy, np.ones((2, 3)) + [[0, 0, 0], [0, 0, np.spacing(1.0)]]])
 
 
 @pytest.mark.parametrize(

@@ -41,17 +41,12 @@ def spatial_order(points: Points, frame: tuple[Points, float] | None = None) -> 
     """
     if len(points) == 0:
         return np.zeros(0, dtype=np.int64)
-    low, extent = frame or frame_of(points)
+    low = points.min(axis=0)
+    low, extent = frame or (low, float((points.max(axis=0) - low).max()))
     cells = np.clip((points - low) / (extent or 1.0) * (2**_BITS - 1), 0, 2**_BITS - 1).astype(np.uint64)
     code = _spread_bits(cells[:, 0]) << np.uint64(2) | _spread_bits(cells[:, 1]) << np.uint64(1) | _spread_bits(cells[:, 2])
     order: Indices = np.argsort(code, kind="stable")
     return order
-
-
-def frame_of(points: Points) -> tuple[Points, float]:
-    """The lowest corner (3,) of (N, 3) points, N >= 1, and their largest extent."""
-    low = points.min(axis=0)
-    return low, float((points.max(axis=0) - low).max())
 
 
 def nearest_to(centre: Points, points: Points, identity: Identity, most: int) -> Indices:

@@ -188,8 +188,10 @@ def denoise(
 
 def _columns(text: str | None) -> tuple[str, ...] | None:
     """Names with commas between; nothing for none; None where nothing is said."""
-    if text is None or text == "none":
-        return None if text is None else ()
+    if text is None:
+        return None
+    if text == "none":
+        return ()
     names = tuple(word.strip() for word in text.split(","))
     if not all(names):
         raise UsageError(f"--align-by {text}: give names of columns with commas between, such as beam,pose, or none")

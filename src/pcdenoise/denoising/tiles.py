@@ -69,8 +69,10 @@ _N_LENGTHS = 1_000_000
 
 def needs_the_whole(model: Model | None, config: DenoiseConfig) -> str:
     """What in these settings draws from a whole cloud, so that cells cannot be cleaned one by one; nothing if all is local."""
-    if config.unshrink or config.align_by:
-        return "--unshrink" if config.unshrink else "--align-by"
+    if config.unshrink:
+        return "--unshrink"
+    if config.align_by:
+        return "--align-by"
     return "a model of network mcconv" if model is not None and model.config.network == "mcconv" else ""
 
 
