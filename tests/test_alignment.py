@@ -146,6 +146,15 @@ def test_the_command_aligns_by_columns_and_says_so(tmp_path: Path, capsys: pytes
     assert sample.error(cleaned.points) < clean + 0.25 * (plain - clean)
 
 
+def test_iterate_aligns_as_denoise_does(tmp_path: Path) -> None:
+    write_off_by_beam(tmp_path / "scan.ply")
+    options = ["--align-by", "beam", "--iters", "2", "-q"]
+    assert main(["denoise", str(tmp_path / "scan.ply"), "-o", str(tmp_path / "out.ply"), *options]) == 0
+    assert main(["iterate", str(tmp_path / "scan.ply"), "-o", str(tmp_path / "steps"), *options]) == 0
+    last = pcdenoise.read(tmp_path / "steps" / "scan_2.ply").points
+    assert np.array_equal(last, pcdenoise.read(tmp_path / "out.ply").points)
+
+
 def test_the_command_refuses_columns_that_are_not_there_and_cells(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_off_by_beam(tmp_path / "scan.ply")
     wanted = ["denoise", str(tmp_path / "scan.ply"), "-o", str(tmp_path / "out.ply"), "-q"]

@@ -79,6 +79,20 @@ def test_a_filled_volume_is_no_surface(rng: np.random.Generator, name: str, n: i
     assert not estimate(NO_SURFACE[name](n, rng), threads=1).is_surface
 
 
+@pytest.mark.parametrize("n", [16, 32, 64])
+@pytest.mark.parametrize("name", NO_SURFACE)
+def test_few_points_in_a_volume_are_taken_for_a_surface_by_chance_alone(rng: np.random.Generator, name: str, n: int) -> None:
+    # One in twenty is; 12 or more of 60 are with a chance below 0.0001.
+    assert sum(estimate(NO_SURFACE[name](n, rng), threads=1).is_surface for _ in range(60)) < 12
+
+
+@pytest.mark.parametrize("n", [16, 32, 64])
+def test_few_points_on_a_sheet_show_it(rng: np.random.Generator, n: int) -> None:
+    sheet = rng.uniform(-1, 1, (n, 3)) * (1, 1, 0)
+    std = 0.2 * 2 / np.sqrt(n)
+    assert all(estimate(sheet + rng.normal(0, std, (n, 3)), threads=1).is_surface for _ in range(20))
+
+
 @pytest.mark.parametrize("factor", [2.0**-20, 2.0**30])
 def test_the_estimate_scales_with_the_cloud(factor: float) -> None:
     # Coordinates hash differently in another unit, so that other probes would be drawn from more points; nothing else may change.

@@ -79,6 +79,14 @@ def test_only_class_and_roi_leave_every_other_record_of_a_las_as_it_is(tmp_path:
     assert np.array_equal(cleaned.source.file.records[~chosen], scan.source.file.records[~chosen])
 
 
+def test_a_selection_of_nothing_is_said_and_the_scan_written_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before, after = tmp_path / "before.las", tmp_path / "after.las"
+    before.write_bytes(las(4, 6, records=las_records(6, 300, 0)))
+    assert main(["denoise", str(before), "-o", str(after), "--only-class", "255", "--roi", "0,0,1,1"]) == 0
+    assert "before.las: no point is asked for by --only-class 255 and --roi; written as it is" in capsys.readouterr().err
+    assert np.array_equal(pcdenoise.read(after).source.file.records, pcdenoise.read(before).source.file.records)
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [

@@ -44,8 +44,7 @@ def denoise(
         if chosen.align_by:
             raise UsageError("align_by: names columns, which an array has not; give a Scan")
         return denoiser.denoise(rows, loaded, chosen, on_progress)
-    of_model = loaded.config.align_by if loaded else ()
-    groups = groups_asked_for(points, chosen.align_by, of_model, lambda _fault: None)[1]
+    groups = groups_asked_for(points, loaded, chosen)
     shift = None if groups is None else denoiser.shift_of(rows, groups, loaded, chosen)[0]
     return denoiser.denoise(rows, loaded, chosen, on_progress, shift=shift)
 

@@ -35,7 +35,10 @@ A ball that is filled with noise has 2.3 to 2.9 at any size, a disc of radius R 
 """
 _CERTAIN_ASPECT, _SMALL_SHARE = 4.4, 1 / 40
 """A surface shows in a small share of the cloud, or more clearly than a solid ball, cube or blob ever does: those have up to 4.3,
-once a neighbourhood is half of them."""
+in neighbourhoods of half of them."""
+_MOST_OF_IT, _FEW_POINTS = 3 / 4, 31
+"""Larger shares of a cloud are seen from its edge, from where any blob looks flat. And what a quadric leaves of few points scatters:
+of balls, cubes and blobs of N points 19 in 20 stay below _CERTAIN_ASPECT + (_FEW_POINTS / N)²."""
 _CLEARER_SHARE = 0.3  # this share of all places must show it: edges and thin parts stay thick at any scale
 _SEEN = ([3.0, 3.7, 4.1, 4.7, 5.2, 6.1, 8.0], [0.72, 0.82, 0.86, 0.9, 0.92, 0.94, 0.95])
 _POINTS_PER_PLACE, _POINTS_AROUND, _PLACES_SEED = 32, 384, 5
@@ -147,7 +150,9 @@ def estimate_from(probed: Points, n_points: int, nearest: Nearest, known_std: fl
         std = known_std or max(rungs, key=lambda rung: rung.aspect).std
         return level(std, spacing, float(_LADDER[0]), False)
     std = known_std or shown[0].std
-    certain = shown[0].k <= _SMALL_SHARE * n_points or max(rung.aspect for rung in shown) >= _CERTAIN_ASPECT
+    telling = [rung for rung in shown if rung.k <= max(_LADDER[0], _MOST_OF_IT * n_points)]
+    clearest = max((rung.aspect for rung in telling), default=0.0)
+    certain = shown[0].k <= _SMALL_SHARE * n_points or clearest >= _CERTAIN_ASPECT + (_FEW_POINTS / n_points) ** 2
     return level(std, spacing, _points_within(_SCALE_STDS * std, rungs), certain)
 
 

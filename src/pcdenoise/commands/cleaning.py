@@ -1,6 +1,7 @@
 """How one scan of `pcdenoise denoise` is cleaned: whole, or in cells on disk where it does not fit in memory.
 
-Not here: options and which file becomes which (denoise.py), how cells are cleaned (denoising/tiles.py).
+Not here: options and which file becomes which (denoise.py), groups that are shifted first (aligning.py), how cells are cleaned
+(denoising/tiles.py).
 """
 
 from __future__ import annotations
@@ -9,13 +10,13 @@ import os
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pcdenoise import __version__
-from pcdenoise.commands import outputs, selection
+from pcdenoise.commands import aligning, outputs, selection
 from pcdenoise.commands.batch import Figures
 from pcdenoise.commands.console import Console, counted, figure
 from pcdenoise.commands.files import STREAM, Job, format_of
@@ -34,15 +35,14 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from pcdenoise.cloud.scan import Mask, Points, Scan
+    from pcdenoise.cloud.scan import Mask, Scan
     from pcdenoise.config import DenoiseConfig
-    from pcdenoise.denoising.denoiser import Progress, Result
+    from pcdenoise.denoising.denoiser import Result
     from pcdenoise.evaluation.report import Page
     from pcdenoise.io import Stream
     from pcdenoise.networks.store import Model
 
 _PIECE_ROWS = 250_000
-_MOST_GROUPS = 50  # of which --verbose says how they are shifted
 
 
 def chosen_model(name: str | None, settings: DenoiseConfig) -> Model | None:
@@ -198,9 +198,7 @@ class Cleaning:
 
         started = time.perf_counter()
         self._refuse_cells(job, stream)
-        if self.config.align_by is None and self.model and self.model.config.align_by:
-            names = ",".join(self.model.config.align_by)
-            self.console.note(f"{job.source}: not aligned by {names} as the model asks: cleaned in cells")
+        aligning.note_unaligned(str(job.source), self.model, self.config, self.console)
         cell_points = self.tile or points_per_cell(self.max_bytes)
         job.target.parent.mkdir(parents=True, exist_ok=True)
         folder = cells_of(job)
@@ -246,7 +244,9 @@ class Cleaning:
         self._refuse(job, scan)
         with self.console.progress(job.source.name) as on_progress:
             movable, seen = self.selection.masks(scan)
-            shift, aligned = self._shift(job, scan, seen, on_progress)
+            if not movable.any() and self.selection.settings:
+                self.console.note(f"{job.source}: no point is asked for by {self.selection}; written as it is")
+            shift, aligned = aligning.shift(scan, seen, self.model, self.config, self.console, on_progress)
             if self.selection == selection.Selection():
                 result = denoiser.denoise(scan.points, self.model, self.config, on_progress, shift=shift)
             else:
@@ -276,29 +276,6 @@ class Cleaning:
         self.console.note(f"{job.target}: {_summary(figures)}" + (f"; picture {picture}" if picture else ""))
         return figures
 
-    def _shift(self, job: Job, scan: Scan, seen: Mask, on_progress: Progress) -> tuple[Points | None, Figures]:
-        """(N, 3) by how much rows are moved so that groups of them meet, if they are to be aligned, and figures of that."""
-        import numpy as np
-
-        from pcdenoise.denoising import denoiser
-        from pcdenoise.denoising.alignment import groups_asked_for
-
-        of_model = self.model.config.align_by if self.model else ()
-        on_fault = partial(_note_as_it_is, self.console)
-        names, groups = groups_asked_for(scan, self.config.align_by, of_model, on_fault)
-        if groups is None:
-            return None, {}
-        on_progress("aligning", 0.0)
-        shift = np.zeros((len(scan), 3))
-        shift[seen], figures = denoiser.shift_of(scan.points[seen], groups[seen], self.model, self.config)
-        rows, sizes = np.unique(groups, return_index=True, return_counts=True)[1:]
-        for row, n in zip(rows[:_MOST_GROUPS], sizes, strict=False):
-            values = ", ".join(f"{name} {scan.attributes[name][row]}" for name in names)
-            self.console.detail(f"{values}: {counted(int(n), 'point')} shifted by {', '.join(map(figure, shift[row]))}")
-        if len(rows) > _MOST_GROUPS:
-            self.console.detail(f"and {len(rows) - _MOST_GROUPS:,} more groups")
-        return shift, {"aligned_by": ",".join(names), **figures}
-
     def _written(self, scan: Scan, result: Result) -> Scan:
         """The moved scan as it is to be written: colours, further columns, without the rows that were not wanted."""
         from pcdenoise import io
@@ -316,10 +293,6 @@ class Cleaning:
         if std is not None:
             cleaned = with_uncertainty(cleaned, std)
         return with_outliers(cleaned, outlier) if self.config.outliers == "flag" else cleaned
-
-
-def _note_as_it_is(console: Console, fault: str) -> None:
-    console.note(f"{fault}; cleaned as it is")
 
 
 def picture_notes(result: Result, unit: str) -> tuple[str, str]:

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pcdenoise.commands import files, options, outputs, selection
+from pcdenoise.commands import aligning, files, options, outputs, selection
 from pcdenoise.commands import workers as workers_
 from pcdenoise.commands.batch import Batch
 from pcdenoise.commands.cleaning import Cleaning, cells_of, refuse_model
@@ -45,15 +45,6 @@ Draws = Annotated[
         help="Mean over so many random choices: less error where there is much noise; 4 take twice the time.",
     ),
 ]
-AlignBy = Annotated[
-    str | None,
-    option(
-        "--align-by",
-        metavar="NAME,...|none",
-        help="Points that agree in these columns (beam, scan_direction_flag, point_source_id) are off together: first shift"
-        " such groups onto each other. A model adapted by train says so itself.",
-    ),
-]
 
 _UNTOLD = Path("?")
 """The output of a plan that names none."""
@@ -67,7 +58,7 @@ def denoise(
     iters: Iters = "1",
     draws: Draws = 1,
     noise: options.Noise = None,
-    align_by: AlignBy = None,
+    align_by: aligning.AlignBy = None,
     unshrink: Unshrink = None,
     neighbours: Neighbours = None,
     radius: Radius = None,
@@ -138,7 +129,7 @@ def denoise(
     from pcdenoise.config import DenoiseConfig
 
     settings = configured(
-        DenoiseConfig, method=method, iters=iters, draws=draws, noise=noise, align_by=_columns(align_by),
+        DenoiseConfig, method=method, iters=iters, draws=draws, noise=noise, align_by=aligning.columns(align_by),
         strength=strength, max_move=max_move, outliers=outliers, unshrink=unshrink, neighbours=neighbours, radius=radius,
         sigma_d=sigma_d, sigma_n=sigma_n, uncertainty=uncertainty, seed=seed, threads=threads,
     )  # fmt: skip
@@ -184,18 +175,6 @@ def denoise(
         page = cleaning.pages[0] if len(jobs) == len(cleaning.pages) == 1 else None
         outputs.save_report(report, "denoise", cleaning.settings, batch.records, page, overwrite=overwrite)
     batch.close()
-
-
-def _columns(text: str | None) -> tuple[str, ...] | None:
-    """Names with commas between; nothing for none; None where nothing is said."""
-    if text is None:
-        return None
-    if text == "none":
-        return ()
-    names = tuple(word.strip() for word in text.split(","))
-    if not all(names):
-        raise UsageError(f"--align-by {text}: give names of columns with commas between, such as beam,pose, or none")
-    return names
 
 
 def _plan_text(records: list[dict[str, Any]], done: list[Job], settings: DenoiseConfig) -> str:

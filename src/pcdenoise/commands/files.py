@@ -48,7 +48,8 @@ def _expand_one(text: str) -> list[Path]:
         visible = (entry for entry in path.iterdir() if not entry.name.startswith("."))
         scans = sorted(entry for entry in visible if entry.is_file() and io.is_scan(entry))
         if not scans:
-            raise ScanError(f"{text}: the folder holds no scan; known suffixes are {' '.join(sorted(io.SUFFIXES))}")
+            below = f"; for folders below it give '{path.as_posix()}/**'" if any(map(Path.is_dir, path.iterdir())) else ""
+            raise ScanError(f"{text}: the folder holds no scan; known suffixes are {' '.join(sorted(io.SUFFIXES))}{below}")
         return scans
     if glob.has_magic(text):
         matches = sorted(path for path in _matches(text) if path.is_file())

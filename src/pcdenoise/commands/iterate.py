@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pcdenoise.commands import options, outputs
+from pcdenoise.commands import aligning, options, outputs
 from pcdenoise.commands.cleaning import chosen_model, named_model
 from pcdenoise.commands.console import Console, counted, figure, table
 from pcdenoise.commands.denoise import Draws, Iters, Method, Neighbours, Radius, SigmaD, SigmaN, Unshrink
@@ -27,6 +27,7 @@ def iterate(
     iters: Iters = "5",
     draws: Draws = 1,
     noise: options.Noise = None,
+    align_by: aligning.AlignBy = None,
     unshrink: Unshrink = None,
     neighbours: Neighbours = None,
     radius: Radius = None,
@@ -47,14 +48,16 @@ def iterate(
 
     Example: pcdenoise iterate scan.laz -o steps/ --iters 5
     """
+    import numpy as np
+
     from pcdenoise import io
     from pcdenoise.config import DenoiseConfig
     from pcdenoise.denoising import denoiser
     from pcdenoise.synthesis.meshes import load_mesh
 
     settings = configured(
-        DenoiseConfig, method=method, iters=iters, draws=draws, noise=noise, unshrink=unshrink, neighbours=neighbours,
-        radius=radius, sigma_d=sigma_d, sigma_n=sigma_n, seed=seed, threads=threads,
+        DenoiseConfig, method=method, iters=iters, draws=draws, noise=noise, align_by=aligning.columns(align_by),
+        unshrink=unshrink, neighbours=neighbours, radius=radius, sigma_d=sigma_d, sigma_n=sigma_n, seed=seed, threads=threads,
     )  # fmt: skip
     strip, report = output / "passes.png", output / "report.html"
     refuse_file(output)
@@ -69,8 +72,10 @@ def iterate(
     weights = chosen_model(model, settings)
     named = {**settings.model_dump(mode="json"), **named_model(weights)}
     passes = [_Pass(scan.points, truth.errors(scan.points))]
-    with Console(quiet).progress(source.name) as on_progress:
-        for number, step in enumerate(denoiser.iterate(scan.points, weights, settings), start=1):
+    console = Console(quiet)
+    with console.progress(source.name) as on_progress:
+        shift, aligned = aligning.shift(scan, np.ones(len(scan), bool), weights, settings, console, on_progress)
+        for number, step in enumerate(denoiser.iterate(scan.points, weights, settings, shift=shift), start=1):
             on_progress(f"pass {number}", 0.0 if settings.iters == "auto" else number / settings.iters)
             output.mkdir(parents=True, exist_ok=True)
             io.write(
@@ -82,8 +87,8 @@ def iterate(
     output.mkdir(parents=True, exist_ok=True)  # a scan without a surface has no pass
     print(_as_text(passes))
     _save_strip(strip, scan, passes, overwrite)
-    _save_report(report, scan, passes, named, overwrite)
-    Console(quiet).note(f"{output}: {counted(len(passes) - 1, 'pass', 'passes')}, {strip.name}, {report.name}")
+    _save_report(report, scan, passes, {**named, **aligned}, overwrite)
+    console.note(f"{output}: {counted(len(passes) - 1, 'pass', 'passes')}, {strip.name}, {report.name}")
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,11 @@ class Selection:
             raise UsageError("--context all: says which classes are seen beside --only-class; give that too")
         return cls(classes, _box(roi) if roi else None, context == "all")
 
+    def __str__(self) -> str:
+        """The options that it was asked for by."""
+        classes = "" if self.classes is None else f"--only-class {','.join(map(str, self.classes))}"
+        return " and ".join(filter(None, [classes, "--roi" if self.box else ""]))
+
     @property
     def settings(self) -> dict[str, Any]:
         """By option name, for the report and the file's provenance; nothing where nothing was selected."""

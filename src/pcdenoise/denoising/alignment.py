@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from pcdenoise.cloud.blocks import each_block
 from pcdenoise.cloud.neighbours import NeighbourSearch, principal_axes
 from pcdenoise.cloud.scan import Points, Scan
+from pcdenoise.config import DenoiseConfig
 from pcdenoise.errors import ScanError
+from pcdenoise.networks.store import Model
 
 Groups = NDArray[np.int64]
 """(N,) the number of each point's group, from 0 on."""
@@ -59,21 +61,28 @@ def groups_of(scan: Scan, names: Sequence[str]) -> Groups:
     return groups
 
 
-def groups_asked_for(
-    scan: Scan, asked: Sequence[str] | None, of_model: Sequence[str], on_fault: Callable[[str], None]
-) -> tuple[Sequence[str], Groups | None]:
-    """The columns to align by and the groups that they make: those asked for, or else what the model was adapted to.
+def columns_asked_for(model: Model | None, config: DenoiseConfig) -> tuple[str, ...]:
+    """The columns to align by: those of the settings, or else what the model was adapted to."""
+    of_model = model.config.align_by if model is not None else ()
+    return of_model if config.align_by is None else config.align_by
 
-    A scan need not have what a model names: then `on_fault` hears why there are no groups. Raises ScanError for what is asked.
+
+def groups_asked_for(
+    scan: Scan, model: Model | None, config: DenoiseConfig, on_fault: Callable[[str], None] = lambda _fault: None
+) -> Groups | None:
+    """The groups (N,) that a scan is to be aligned by, if there are any.
+
+    A scan need not have what a model names: then `on_fault` hears why there are no groups. Raises ScanError for what the settings
+    name.
     """
-    names = of_model if asked is None else asked
+    names = columns_asked_for(model, config)
     try:
-        return names, groups_of(scan, names) if names else None
+        return groups_of(scan, names) if names else None
     except ScanError as fault:
-        if asked is not None:
+        if config.align_by is not None:
             raise
         on_fault(str(fault))
-        return names, None
+        return None
 
 
 @dataclass(frozen=True)

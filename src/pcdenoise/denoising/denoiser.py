@@ -157,9 +157,9 @@ def shift_of(points: Points, group: Groups, model: Model | None, config: Denoise
     return shift, {"groups": len(alignment), "offset": offset}
 
 
-def iterate(points: Points, model: Model | None, config: DenoiseConfig) -> Iterator[Step]:
-    """Pass after pass, each fed with the last one's output: (N, 3) points and figures of every step."""
-    cloud = _Cloud(points, model, config)
+def iterate(points: Points, model: Model | None, config: DenoiseConfig, *, shift: Points | None = None) -> Iterator[Step]:
+    """Pass after pass, each fed with the last one's output: (N, 3) points and figures of every step. shift as of `denoise`."""
+    cloud = _Cloud(points, model, config, shift=shift)
     for step in _passes(cloud, model, config, lambda _task, _share: None, is_judged=True):
         yield Step(cloud.placed(step.points), step.figures)
 

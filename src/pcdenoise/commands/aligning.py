@@ -1,0 +1,77 @@
+"""`--align-by`: how groups of a scan's points are shifted onto each other before it is cleaned, and what is said of that.
+
+Not here: how the offsets are found (denoising/alignment.py).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+from pcdenoise.commands.batch import Figures
+from pcdenoise.commands.console import Console, counted, figure
+from pcdenoise.commands.options import option
+from pcdenoise.errors import UsageError
+
+if TYPE_CHECKING:
+    from pcdenoise.cloud.scan import Mask, Points, Scan
+    from pcdenoise.config import DenoiseConfig
+    from pcdenoise.denoising.denoiser import Progress
+    from pcdenoise.networks.store import Model
+
+AlignBy = Annotated[
+    str | None,
+    option(
+        "--align-by",
+        metavar="NAME,...|none",
+        help="Points that agree in these columns (beam, scan_direction_flag, point_source_id) are off together: first shift"
+        " such groups onto each other. A model adapted by train says so itself.",
+    ),
+]
+_MOST_GROUPS = 50  # of which --verbose says how they are shifted
+
+
+def columns(text: str | None) -> tuple[str, ...] | None:
+    """Names with commas between; nothing for none; None where nothing is said."""
+    if text is None:
+        return None
+    if text == "none":
+        return ()
+    names = tuple(word.strip() for word in text.split(","))
+    if not all(names):
+        raise UsageError(f"--align-by {text}: give names of columns with commas between, such as beam,pose, or none")
+    return names
+
+
+def shift(
+    scan: Scan, seen: Mask, model: Model | None, config: DenoiseConfig, console: Console, on_progress: Progress
+) -> tuple[Points | None, Figures]:
+    """(N, 3) by how much rows are moved so that groups of them meet, if they are to be aligned, and figures of that.
+
+    seen (N,): rows that have a say; the others stay. Raises ScanError for columns that the settings name and the scan has not.
+    """
+    import numpy as np
+
+    from pcdenoise.denoising import denoiser
+    from pcdenoise.denoising.alignment import columns_asked_for, groups_asked_for
+
+    groups = groups_asked_for(scan, model, config, lambda fault: console.note(f"{fault}; cleaned as it is"))
+    if groups is None:
+        return None, {}
+    on_progress("aligning", 0.0)
+    moved, names = np.zeros((len(scan), 3)), columns_asked_for(model, config)
+    moved[seen], figures = denoiser.shift_of(scan.points[seen], groups[seen], model, config)
+    rows, sizes = np.unique(groups, return_index=True, return_counts=True)[1:]
+    for row, n in zip(rows[:_MOST_GROUPS], sizes, strict=False):
+        values = ", ".join(f"{name} {scan.attributes[name][row]}" for name in names)
+        console.detail(f"{values}: {counted(int(n), 'point')} shifted by {', '.join(map(figure, moved[row]))}")
+    if len(rows) > _MOST_GROUPS:
+        console.detail(f"and {len(rows) - _MOST_GROUPS:,} more groups")
+    return moved, {"aligned_by": ",".join(names), **figures}
+
+
+def note_unaligned(source: str, model: Model | None, config: DenoiseConfig, console: Console) -> None:
+    """Says that a scan that is cleaned in cells is not aligned, where its model asks for that."""
+    from pcdenoise.denoising.alignment import columns_asked_for
+
+    if names := columns_asked_for(model, config):
+        console.note(f"{source}: not aligned by {','.join(names)} as the model asks: cleaned in cells")
