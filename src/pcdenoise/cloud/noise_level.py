@@ -37,7 +37,7 @@ _CERTAIN_ASPECT, _SMALL_SHARE = 4.4, 1 / 40
 """A surface shows in a small share of the cloud, or more clearly than a solid ball, cube or blob ever does: those have up to 4.3,
 in neighbourhoods of half of them."""
 _MOST_OF_IT, _FEW_POINTS = 3 / 4, 31
-"""Larger shares of a cloud are seen from its edge, from where any blob looks flat. And what a quadric leaves of few points scatters:
+"""More of a cloud is seen from its edge, from where any blob looks flat. And what a quadric leaves of few points is chance:
 of balls, cubes and blobs of N points 19 in 20 stay below _CERTAIN_ASPECT + (_FEW_POINTS / N)²."""
 _CLEARER_SHARE = 0.3  # this share of all places must show it: edges and thin parts stay thick at any scale
 _SEEN = ([3.0, 3.7, 4.1, 4.7, 5.2, 6.1, 8.0], [0.72, 0.82, 0.86, 0.9, 0.92, 0.94, 0.95])
