@@ -248,3 +248,12 @@ def test_the_benchmark_of_speed_runs(tmp_path: Path) -> None:
     assert [(row["name"], row["n"]) for row in rows] == [(name, n) for n in (2000, 4000) for name in ("pcdenoise", "scipy kNN")]
     assert all(row["per_cpu_s"] > 0 and row["peak_bytes"] > 2**20 for row in rows)
     assert (tmp_path / "speed.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_cells_are_as_large_as_asked_for_where_many_points_share_a_place(rng: np.random.Generator, tmp_path: Path) -> None:
+    wall = rng.random((6000, 3)) * (0, 1, 1)  # the lowest place along the longest axis
+    points = np.concatenate([wall, rng.random((4000, 3)) * (10, 1, 1)])
+    job = Tiles(tmp_path / "cells", lambda: [points], None, DenoiseConfig(method="mean"), 1000, {})
+    sizes = [(tmp_path / "cells" / "start" / f"{cell}.i8").stat().st_size // 8 for cell in job.cells]
+    assert sum(sizes) == len(points)
+    assert max(sizes) < 2000

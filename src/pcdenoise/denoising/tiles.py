@@ -541,11 +541,15 @@ def _cuts(sample: Points, n_cells: int) -> Cuts:
         if n == 1 or len(points) < 2:
             return [next(next_number)]
         axis = int(np.ptp(points, axis=0).argmax())
-        place = float(np.quantile(points[:, axis], (n // 2) / n))
-        below = points[:, axis] < place
-        if not below.any():
+        along = points[:, axis]
+        place = float(np.quantile(along, (n // 2) / n))
+        if place <= along.min():  # where many points share it: those form the lower part
+            place = float(along[along > place].min(initial=np.inf))
+        below = along < place
+        if below.all():
             return [next(next_number)]
-        return [axis, place, cut(points[below], n // 2), cut(points[~below], n - n // 2)]
+        n_below = min(max(round(n * float(below.mean())), 1), n - 1)
+        return [axis, place, cut(points[below], n_below), cut(points[~below], n - n_below)]
 
     return cut(sample, n_cells)
 
