@@ -246,6 +246,20 @@ def test_a_signal_that_was_ignored_stays_ignored(monkeypatch: pytest.MonkeyPatch
         signal.signal(signal.SIGHUP, before)
 
 
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs a folder in which nobody can make a file")
+@pytest.mark.parametrize("output", ["/proc/clean.xyz", "/proc/new/clean.xyz"])
+def test_a_folder_that_takes_no_file_is_told_before_any_scan_is_read(
+    output: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scan = tmp_path / "scan.xyz"
+    scan.write_text("no scan")
+    assert main(["denoise", str(scan), "-o", output]) == 3
+    assert capsys.readouterr().err.startswith(f"pcdenoise: {output}: cannot be written (")
+    assert main(["denoise", str(scan), "-o", str(tmp_path / "clean.xyz"), "--report", "/proc/report.json"]) == 3
+    assert "pcdenoise: /proc/report.json: cannot be written (" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["scan.xyz"]
+
+
 SHELL = {
     "denoise {scan} -o - --format xyz -q --method mean > /dev/full": (3, "stdout: cannot be written"),
     "info {scan} > /dev/full": (3, "stdout: No space left on device"),

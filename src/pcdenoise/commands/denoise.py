@@ -152,7 +152,9 @@ def denoise(
     done = [job for job in jobs if resume and job.target != STREAM and job.target.exists()]
     jobs = [job for job in jobs if job not in done]
     pictures = {job.source: job.target for job in drawn if job.source in {job.source for job in jobs}}
-    refuse_existing([*(job.target for job in jobs), *pictures.values(), report], overwrite or resume)
+    targets = [*(job.target for job in jobs if output), *pictures.values(), report]
+    refuse_existing(targets, overwrite or resume)
+    files.refuse_unwritable(targets)
     for job in [] if dry_run else done if resume else jobs:
         shutil.rmtree(cells_of(job), ignore_errors=True)
     chosen = selection.Selection.of(only_class, context, roi)

@@ -7,6 +7,7 @@ import heapq
 import os
 import re
 import stat
+import tempfile
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -163,6 +164,22 @@ def refuse_existing(targets: Sequence[Path | None], overwrite: bool) -> None:
             raise ScanError(f"{target}: the file exists; add --overwrite to replace it")
         if target.is_file() and not target.stat().st_mode & _WRITABLE:
             raise ScanError(f"{target}: is read-only, so that --overwrite leaves it; make it writable or write elsewhere")
+
+
+def refuse_unwritable(targets: Sequence[Path | None]) -> None:
+    """Raises ScanError before any work is done if a target is to be in a folder where no file can be made."""
+    of_folder: dict[Path, Path] = {}
+    for target in targets:
+        if target is not None and target != STREAM:
+            place = Path(os.path.realpath(target))
+            if place.is_file() or not place.exists():  # devices and pipes are written to as they are
+                of_folder.setdefault(next(folder for folder in place.parents if folder.exists()), target)
+    for folder, target in of_folder.items():
+        if folder.is_dir():
+            try:
+                tempfile.TemporaryFile(dir=folder).close()
+            except OSError as fault:
+                raise ScanError(f"{target}: cannot be written ({fault.strerror}); check the folder's permissions") from None
 
 
 def refuse_unknown(targets: Sequence[Path], format: str | None) -> None:
