@@ -1,6 +1,7 @@
 """Clouds larger than memory: cells on disk, each cleaned with what lies around it, so that a tile gives what the whole gives.
 
-Here: the cells, their surroundings, what is kept for a later `resume`. Not here: scan files (io), one pass (denoiser.py).
+Here: the cells, their surroundings, what is kept for a later `resume`. Not here: where space is cut (cuts.py), scan files (io),
+one pass (denoiser.py).
 
 All that is global in a pass is found first, streaming, exactly as it is found in memory: the frame's origin, the probes and the
 noise level they read, the stop rule. The rest is local, and every draw is a hash of a point's place in the file, so a cell needs
@@ -46,6 +47,7 @@ from pcdenoise.cloud.noise_level import N_PROBES, NoiseLevel, by_place, estimate
 from pcdenoise.cloud.scan import Mask, Points, check_extent
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import classical, denoiser, outliers, risk, taken_off, uncertainty
+from pcdenoise.denoising.cuts import by_cell, cell_of, cuts_of, number_of_cells
 from pcdenoise.denoising.denoiser import Progress
 from pcdenoise.denoising.seeds import share_of_seeds
 from pcdenoise.networks.store import Model
@@ -164,7 +166,7 @@ class Tiles:
         if n_finite:
             check_extent(np.stack([low, high]))
         origin = denoiser.origin_of(central.points)
-        cuts = _cuts(central.points - origin, max(1, -(-n_finite // self.cell_points)))
+        cuts = cuts_of(central.points - origin, max(1, -(-n_finite // self.cell_points)))
         plan: dict[str, Any] = {
             "job": self.job,
             "cell_points": self.cell_points,
@@ -173,14 +175,18 @@ class Tiles:
             "origin": origin.tolist(),
             "cuts": cuts,
         }
-        plan |= {"n_cells": _n_cells(cuts), "probes": (probed.points - origin).tolist(), "probe_keys": probed.keys.tolist()}
+        plan |= {
+            "n_cells": number_of_cells(cuts),
+            "probes": (probed.points - origin).tolist(),
+            "probe_keys": probed.keys.tolist(),
+        }
         low, high = (low - origin, high - origin) if n_finite else (np.zeros(3), np.zeros(3))
         plan |= {"diagonal": float(np.linalg.norm(high - low)), "low": low.tolist(), "extent": float((high - low).max())}
         for chunk in self.chunks():
             usable = chunk[np.isfinite(chunk).all(axis=1)]
             rows = np.empty((len(usable), 4))
             rows[:, :3], rows[:, 3] = usable - origin, coordinate_hash(usable, 0).view(np.float64)
-            for cell, those in _by_cell(_cell_of(rows[:, :3], cuts)):
+            for cell, those in by_cell(cell_of(rows[:, :3], cuts)):
                 with (self.folder / "start" / f"{cell}.f64").open("ab") as file:
                     file.write(rows[those].tobytes())
         plan["n_distinct"] = sum(self._sort(cell) for cell in range(plan["n_cells"]))
@@ -265,7 +271,7 @@ class Tiles:
             finite = np.flatnonzero(np.isfinite(chunk).all(axis=1))
             std = np.full(len(chunk), np.nan) if self.config.uncertainty else None
             result = Rows(chunk.copy(), np.zeros(len(chunk), bool), np.ones(len(chunk), bool), std)
-            for cell, those in _by_cell(_cell_of(chunk[finite] - origin, self.plan["cuts"])):
+            for cell, those in by_cell(cell_of(chunk[finite] - origin, self.plan["cuts"])):
                 path = self.folder / "done" / f"{cell}.f64"
                 done = np.fromfile(path, count=width * len(those), offset=8 * width * read[cell]).reshape(-1, width)
                 read[cell] += len(those)
@@ -295,17 +301,13 @@ class Tiles:
         if path.is_file():
             return NoiseLevel(**json.loads(path.read_text()))
         probed, keys = np.array(plan["probes"]).reshape(-1, 3), np.array(plan["probe_keys"], np.uint64)
-        homes: dict[int, NDArray[np.int64]] = {}
-        for cell, those in _by_cell(_cell_of(probed, plan["cuts"])):
-            homes[cell] = those
+        home: dict[bytes, int] = {}
+        for cell, those in by_cell(cell_of(probed, plan["cuts"])):
             part = self._part(cell, number)
             drawn = drawn_by(part.identity, self.config.seed)
             order = np.argsort(drawn)
             probed[those] = part.points[order[np.searchsorted(drawn, keys[those], sorter=order)]]
-        cell_of = np.empty(len(probed), np.int64)
-        for cell, those in homes.items():
-            cell_of[those] = cell
-        home = {point.tobytes(): int(cell) for point, cell in zip(probed, cell_of, strict=True)}
+            home |= {point.tobytes(): cell for point in probed[those]}
         self._gathered = {k: {} for k in _GATHERED}
 
         def around(centres: Points, k: int) -> tuple[Distances, Points]:
@@ -314,7 +316,7 @@ class Tiles:
             if missing.any():
                 most = min(next(n for n in _GATHERED if n >= k), plan["n_distinct"])
                 cells = np.array([home[centre.tobytes()] for centre in centres[missing]])
-                for cell, those in _by_cell(cells):
+                for cell, those in by_cell(cells):
                     asked = centres[missing][those]
                     distances, near = self._nearest(asked, cell, number, most)
                     kept.update({centre.tobytes(): pair for centre, *pair in zip(asked, distances, near, strict=True)})
@@ -358,7 +360,7 @@ class Tiles:
     def _around(self, centre: Points, most: int) -> taken_off.Sample:
         """So many points nearest to a place, as they are in the file."""
         most = min(most, self.plan["n_distinct"])
-        cell = int(_cell_of(centre[None], self.plan["cuts"])[0])
+        cell = int(cell_of(centre[None], self.plan["cuts"])[0])
         part = self._part(cell, 0)
         margin = max(float(np.ptp(part.points, axis=0).max()), 1e-12)
         while True:
@@ -527,55 +529,3 @@ def _write(path: Path, data: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with replaced(path) as file:
         file.write(data)
-
-
-Cuts = list[Any]
-"""A cell's number in a list of its own, or [axis, place, cuts below, cuts from there on]."""
-
-
-def _cuts(sample: Points, n_cells: int) -> Cuts:
-    """Halves a sample across its longest axis again and again, until there are so many cells."""
-    next_number = iter(range(n_cells))
-
-    def cut(points: Points, n: int) -> Cuts:
-        if n == 1 or len(points) < 2:
-            return [next(next_number)]
-        axis = int(np.ptp(points, axis=0).argmax())
-        along = points[:, axis]
-        place = float(np.quantile(along, (n // 2) / n))
-        if place <= along.min():  # where many points share it: those form the lower part
-            place = float(along[along > place].min(initial=np.inf))
-        below = along < place
-        if below.all():
-            return [next(next_number)]
-        n_below = min(max(round(n * float(below.mean())), 1), n - 1)
-        return [axis, place, cut(points[below], n_below), cut(points[~below], n - n_below)]
-
-    return cut(sample, n_cells)
-
-
-def _n_cells(cuts: Cuts) -> int:
-    return 1 if len(cuts) == 1 else _n_cells(cuts[2]) + _n_cells(cuts[3])
-
-
-def _cell_of(points: Points, cuts: Cuts) -> NDArray[np.int64]:
-    """(N,) the cell that each of (N, 3) points is in."""
-    cells = np.empty(len(points), np.int64)
-
-    def place(rows: NDArray[np.int64], cuts: Cuts) -> None:
-        if len(cuts) == 1:
-            cells[rows] = cuts[0]
-            return
-        below = points[rows, cuts[0]] < cuts[1]
-        place(rows[below], cuts[2])
-        place(rows[~below], cuts[3])
-
-    place(np.arange(len(points)), cuts)
-    return cells
-
-
-def _by_cell(cells: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Each cell that occurs and the rows, ascending, that are in it."""
-    order = np.argsort(cells, kind="stable")
-    found, first = np.unique(cells[order], return_index=True)
-    yield from zip(found.tolist(), np.split(order, first[1:]) if len(found) else [], strict=True)
