@@ -329,6 +329,18 @@ def test_links_in_circles_are_entered_once_and_hidden_files_are_left_alone(
     assert "in/self.xyz" in one_line(capsys.readouterr().err)
 
 
+def test_a_folder_whose_folders_may_hold_scans_names_the_pattern_for_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    above = tmp_path / "above"
+    (above / "visible").mkdir(parents=True)
+    assert main(["info", str(above)]) == 3
+    assert f"give '{above.as_posix()}/**'" in one_line(capsys.readouterr().err)
+    (above / "visible").rename(above / ".hidden")  # which no pattern enters
+    assert main(["info", str(above)]) == 3
+    assert "/**" not in one_line(capsys.readouterr().err)
+
+
 def test_a_name_that_is_no_utf8_is_shown_and_reported(scan: Path, capsys: pytest.CaptureFixture[str]) -> None:
     odd = scan.with_name("\udcff.xyz")
     scan.rename(odd)

@@ -150,8 +150,7 @@ def estimate_from(probed: Points, n_points: int, nearest: Nearest, known_std: fl
         std = known_std or max(rungs, key=lambda rung: rung.aspect).std
         return level(std, spacing, float(_LADDER[0]), False)
     std = known_std or shown[0].std
-    telling = [rung for rung in shown if rung.k <= max(_LADDER[0], _MOST_OF_IT * n_points)]
-    clearest = max((rung.aspect for rung in telling), default=0.0)
+    clearest = max(rung.aspect for rung in rungs if rung.k <= max(_LADDER[0], _MOST_OF_IT * n_points))
     certain = shown[0].k <= _SMALL_SHARE * n_points or clearest >= _CERTAIN_ASPECT + (_FEW_POINTS / n_points) ** 2
     return level(std, spacing, _points_within(_SCALE_STDS * std, rungs), certain)
 

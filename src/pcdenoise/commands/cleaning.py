@@ -244,12 +244,12 @@ class Cleaning:
         self._refuse(job, scan)
         with self.console.progress(job.source.name) as on_progress:
             movable, seen = self.selection.masks(scan)
-            if not movable.any() and self.selection.settings:
-                self.console.note(f"{job.source}: no point is asked for by {self.selection}; written as it is")
             shift, aligned = aligning.shift(scan, seen, self.model, self.config, self.console, on_progress)
             if self.selection == selection.Selection():
                 result = denoiser.denoise(scan.points, self.model, self.config, on_progress, shift=shift)
             else:
+                if not movable.any():
+                    self.console.note(f"{job.source}: no point is asked for by {self.selection}; written as it is")
                 result = denoise_part(scan.points, movable, seen, self.model, self.config, on_progress, shift=shift)
         for step in result.steps:
             self.console.detail(", ".join(f"{name.replace('_', ' ')} {figure(value)}" for name, value in step.figures.items()))

@@ -7,7 +7,6 @@ import heapq
 import os
 import re
 import stat
-import tempfile
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,10 +45,10 @@ def _expand_one(text: str) -> list[Path]:
     if text == "-" or path.is_file():
         return [path]
     if path.is_dir():
-        visible = (entry for entry in path.iterdir() if not entry.name.startswith("."))
+        visible = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
         scans = sorted(entry for entry in visible if entry.is_file() and io.is_scan(entry))
         if not scans:
-            below = f"; for folders below it give '{path.as_posix()}/**'" if any(map(Path.is_dir, path.iterdir())) else ""
+            below = f"; for folders below it give '{path.as_posix()}/**'" if any(map(Path.is_dir, visible)) else ""
             raise ScanError(f"{text}: the folder holds no scan; known suffixes are {' '.join(sorted(io.SUFFIXES))}{below}")
         return scans
     if glob.has_magic(text):
@@ -168,6 +167,8 @@ def refuse_existing(targets: Sequence[Path | None], overwrite: bool) -> None:
 
 def refuse_unwritable(targets: Sequence[Path | None]) -> None:
     """Raises ScanError before any work is done if a target is to be in a folder where no file can be made."""
+    import tempfile  # a help page need not wait for it
+
     of_folder: dict[Path, Path] = {}
     for target in targets:
         if target is not None and target != STREAM:
