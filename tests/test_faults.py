@@ -247,16 +247,26 @@ def test_a_signal_that_was_ignored_stays_ignored(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs a folder in which nobody can make a file")
-@pytest.mark.parametrize("output", ["/proc/clean.xyz", "/proc/new/clean.xyz"])
+@pytest.mark.parametrize(
+    ("command", "target"),
+    [
+        ("denoise {scan} -o {target}", "clean.xyz"),
+        ("denoise {scan} -o {target}", "new/clean.xyz"),
+        ("denoise {scan} -o {scan}.xyz --report {target}", "report.json"),
+        ("info {scan} --picture {target}", "scan.png"),
+        ("bench {scan} --report {target}", "report.json"),
+        ("undo {scan} -o {target}", "raw.las"),
+        ("train --data {scan} -o {model} --report {target}", "report.json"),
+        ("eval-chamfer {scan} --clean {scan} --report {target}", "report.json"),
+    ],
+)
 def test_a_folder_that_takes_no_file_is_told_before_any_scan_is_read(
-    output: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    command: str, target: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    scan = tmp_path / "scan.xyz"
+    scan, target = tmp_path / "scan.xyz", f"/proc/{target}"
     scan.write_text("no scan")
-    assert main(["denoise", str(scan), "-o", output]) == 3
-    assert capsys.readouterr().err.startswith(f"pcdenoise: {output}: cannot be written (")
-    assert main(["denoise", str(scan), "-o", str(tmp_path / "clean.xyz"), "--report", "/proc/report.json"]) == 3
-    assert "pcdenoise: /proc/report.json: cannot be written (" in capsys.readouterr().err
+    assert main(command.format(scan=scan, target=target, model=tmp_path / "model").split()) == 3
+    assert capsys.readouterr().err.startswith(f"pcdenoise: {target}: cannot be written (")
     assert [path.name for path in tmp_path.iterdir()] == ["scan.xyz"]
 
 

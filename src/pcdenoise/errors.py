@@ -78,6 +78,11 @@ def not_a_folder(path: str) -> ScanError:
     return ScanError(f"{path}: is a file where a folder is needed; choose another name")
 
 
+def cannot_be_written(place: object, fault: OSError, check: str = "the folder's permissions and free space") -> ScanError:
+    """What the user is told where the system takes no file; check: what to look at."""
+    return ScanError(f"{place}: cannot be written ({fault.strerror}); check {check}")
+
+
 def in_one_line(fault: BaseException) -> str:
     """What another library's error says, without line breaks and at most 160 characters, to be put into one of ours."""
     return " ".join(str(fault).split())[:160]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pcdenoise.commands import options, outputs
 from pcdenoise.commands.batch import Batch, Figures
 from pcdenoise.commands.console import Console, figure, table
-from pcdenoise.commands.files import STREAM, Job, expand, format_of, refuse_existing
+from pcdenoise.commands.files import STREAM, Job, expand, format_of, refuse_unwritable
 from pcdenoise.commands.options import configured, option
 from pcdenoise.errors import ScanError, UsageError
 
@@ -59,7 +59,7 @@ def bench(
     from pcdenoise.networks import store
 
     times = _times(added)
-    refuse_existing([report], overwrite)
+    refuse_unwritable([report], overwrite)
     console = Console(quiet)
     jobs = [Job(source, STREAM) for source in expand(inputs)]
     models = {name: store.load(name) for name in model or [entry.name for entry in store.available()]}

@@ -13,7 +13,7 @@ from pcdenoise.commands import workers as workers_
 from pcdenoise.commands.batch import Batch
 from pcdenoise.commands.cleaning import Cleaning, cells_of, refuse_model
 from pcdenoise.commands.console import Console, figure, table
-from pcdenoise.commands.files import STREAM, Job, expand, plan, refuse_existing
+from pcdenoise.commands.files import STREAM, Job, expand, plan, refuse_unwritable
 from pcdenoise.commands.memory import n_bytes
 from pcdenoise.commands.options import configured, option
 from pcdenoise.commands.verify import MaxDrift
@@ -153,8 +153,7 @@ def denoise(
     jobs = [job for job in jobs if job not in done]
     pictures = {job.source: job.target for job in drawn if job.source in {job.source for job in jobs}}
     targets = [*(job.target for job in jobs if output), *pictures.values(), report]
-    refuse_existing(targets, overwrite or resume)
-    files.refuse_unwritable(targets)
+    refuse_unwritable(targets, overwrite or resume)
     for job in [] if dry_run else done if resume else jobs:
         shutil.rmtree(cells_of(job), ignore_errors=True)
     chosen = selection.Selection.of(only_class, context, roi)

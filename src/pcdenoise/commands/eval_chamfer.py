@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pcdenoise.commands import options, outputs
 from pcdenoise.commands.batch import Batch, Figures
 from pcdenoise.commands.console import Console, counted, figure, table
-from pcdenoise.commands.files import STREAM, Job, beside, expand, format_of, refuse_existing
+from pcdenoise.commands.files import STREAM, Job, beside, expand, format_of, refuse_unwritable
 from pcdenoise.commands.options import option
 from pcdenoise.errors import ScanError, UsageError
 
@@ -48,7 +48,7 @@ def eval_chamfer(
     sources = expand(inputs)
     coloured = beside(sources, error_ply, "--error-ply", format="ply", suffix="_error")
     pictures = beside(sources, picture, "--picture", format="png", suffix="_error")
-    refuse_existing([*coloured.values(), *pictures.values(), report], overwrite)
+    refuse_unwritable([*coloured.values(), *pictures.values(), report], overwrite)
     clean_points = points_to_compare(clean, format) if clean else None
     measuring = _Measuring(clean_points, load_mesh(mesh) if mesh else None, format, coloured, pictures, overwrite)
     batch = Batch(Console(quiet))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pcdenoise.errors import ScanError, UsageError, not_a_folder
+from pcdenoise.errors import ScanError, UsageError, cannot_be_written, not_a_folder
 
 if TYPE_CHECKING:
     from pcdenoise.cloud.scan import Scan
@@ -154,33 +154,35 @@ def refuse_file(folder: Path) -> None:
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 
 
-def refuse_existing(targets: Sequence[Path | None], overwrite: bool) -> None:
-    """Raises ScanError before any work is done if a target exists and must not be replaced; who made it read-only meant it."""
-    for target in targets:
-        if target is None or target == STREAM or not target.exists():
-            continue
+def refuse_unwritable(targets: Sequence[Path | None], overwrite: bool) -> None:
+    """Raises ScanError before any work is done if a target exists and must not be replaced, or is in a folder that takes no file.
+
+    Who made a file read-only meant it: overwriting is no leave to replace that.
+    """
+    files = [target for target in targets if target is not None and target != STREAM]
+    for target in filter(Path.exists, files):
         if not overwrite:
             raise ScanError(f"{target}: the file exists; add --overwrite to replace it")
         if target.is_file() and not target.stat().st_mode & _WRITABLE:
             raise ScanError(f"{target}: is read-only, so that --overwrite leaves it; make it writable or write elsewhere")
+    _refuse_closed_folders(files)
 
 
-def refuse_unwritable(targets: Sequence[Path | None]) -> None:
-    """Raises ScanError before any work is done if a target is to be in a folder where no file can be made."""
+def _refuse_closed_folders(targets: Sequence[Path]) -> None:
+    """Tries one file in each folder, or in the one that a missing folder is to be made in."""
     import tempfile  # a help page need not wait for it
 
     of_folder: dict[Path, Path] = {}
     for target in targets:
-        if target is not None and target != STREAM:
-            place = Path(os.path.realpath(target))
-            if place.is_file() or not place.exists():  # devices and pipes are written to as they are
-                of_folder.setdefault(next(folder for folder in place.parents if folder.exists()), target)
+        place = Path(os.path.realpath(target))
+        if place.is_file() or not place.exists():  # devices and pipes are written to as they are
+            of_folder.setdefault(next(folder for folder in place.parents if folder.exists()), target)
     for folder, target in of_folder.items():
         if folder.is_dir():
             try:
                 tempfile.TemporaryFile(dir=folder).close()
             except OSError as fault:
-                raise ScanError(f"{target}: cannot be written ({fault.strerror}); check the folder's permissions") from None
+                raise cannot_be_written(target, fault) from None
 
 
 def refuse_unknown(targets: Sequence[Path], format: str | None) -> None:

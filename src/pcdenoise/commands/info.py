@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pcdenoise.commands import options
 from pcdenoise.commands.batch import Batch, Figures
 from pcdenoise.commands.console import Console, facts, figure
-from pcdenoise.commands.files import Job, beside, expand, format_of, refuse_existing, target_name
+from pcdenoise.commands.files import Job, beside, expand, format_of, refuse_unwritable, target_name
 from pcdenoise.commands.options import option
 from pcdenoise.commands.survey import cost_text, survey
 
@@ -52,7 +52,7 @@ def info(
     sources = expand(inputs)
     pictures = beside(sources, picture, "--picture", format="png", suffix="_noise")
     maps = beside(sources, noise_map, "--noise-map", suffix="_noise")
-    refuse_existing([*pictures.values(), *maps.values()], overwrite)
+    refuse_unwritable([*pictures.values(), *maps.values()], overwrite)
 
     def describe(job: Job) -> Figures:
         scan = io.read(job.source, format=format_of(job.source, format))

@@ -11,7 +11,7 @@ from pcdenoise.commands.cleaning import chosen_model, named_model
 from pcdenoise.commands.console import Console, counted, figure, table
 from pcdenoise.commands.denoise import Draws, Iters, Method, Neighbours, Radius, SigmaD, SigmaN, Unshrink
 from pcdenoise.commands.eval_chamfer import points_to_compare
-from pcdenoise.commands.files import format_of, refuse_existing, refuse_file, target_name
+from pcdenoise.commands.files import format_of, refuse_file, refuse_unwritable, target_name
 from pcdenoise.commands.options import argument, configured, option
 
 if TYPE_CHECKING:
@@ -61,13 +61,13 @@ def iterate(
     )  # fmt: skip
     strip, report = output / "passes.png", output / "report.html"
     refuse_file(output)
-    refuse_existing([strip, report], overwrite)
+    refuse_unwritable([strip, report], overwrite)
     scan = io.read(source, format=format_of(source, format))
 
     def target(number: int) -> Path:
         return output / target_name(source, f"_{number}", format, scan.format)
 
-    refuse_existing([] if settings.iters == "auto" else [target(1 + number) for number in range(settings.iters)], overwrite)
+    refuse_unwritable([] if settings.iters == "auto" else [target(1 + number) for number in range(settings.iters)], overwrite)
     truth = _Truth(points_to_compare(clean, format) if clean else None, load_mesh(mesh) if mesh else None)
     weights = chosen_model(model, settings)
     named = {**settings.model_dump(mode="json"), **named_model(weights)}

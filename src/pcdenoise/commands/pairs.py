@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pcdenoise.commands import options
 from pcdenoise.commands.batch import Batch, Figures
 from pcdenoise.commands.console import Console, counted
-from pcdenoise.commands.files import Job, expand, format_of, plan, refuse_existing, refuse_file, target_name
+from pcdenoise.commands.files import Job, expand, format_of, plan, refuse_file, refuse_unwritable, target_name
 from pcdenoise.commands.options import option
 from pcdenoise.errors import UsageError
 
@@ -62,7 +62,7 @@ def pairs(
         kind = "" if to == "npz" else "_clean"
         targets = [output / target_name(job.source, f"_{draw:04d}{kind}", to) for draw in range(1, draws + 1)]
         noisy = [] if to == "npz" else [output / target_name(job.source, "_noisy", to)]
-        refuse_existing([*targets, *noisy], overwrite)
+        refuse_unwritable([*targets, *noisy], overwrite)
         output.mkdir(parents=True, exist_ok=True)
         number = jobs.index(job)
         for draw, target in enumerate(targets):

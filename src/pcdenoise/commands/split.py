@@ -8,7 +8,7 @@ from typing import Annotated
 from pcdenoise.commands import options
 from pcdenoise.commands.batch import Batch, Figures
 from pcdenoise.commands.console import Console, counted
-from pcdenoise.commands.files import Job, expand, format_of, plan, refuse_existing, refuse_file, target_name
+from pcdenoise.commands.files import Job, expand, format_of, plan, refuse_file, refuse_unwritable, target_name
 from pcdenoise.commands.options import option
 
 
@@ -41,7 +41,7 @@ def split(
         pieces = [rows[piece] for piece in parts(scan.points[rows], points)]
         numbers = range(1, len(pieces) + 1)
         targets = [output / target_name(job.source, f"_{number:04d}", format, scan.format) for number in numbers]
-        refuse_existing(targets, overwrite)
+        refuse_unwritable(targets, overwrite)
         output.mkdir(parents=True, exist_ok=True)
         for piece, target in zip(pieces, targets, strict=True):
             chosen = np.zeros(len(scan), dtype=bool)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pcdenoise.commands import options
 from pcdenoise.commands.console import Console, counted
-from pcdenoise.commands.files import refuse_existing
+from pcdenoise.commands.files import refuse_unwritable
 from pcdenoise.commands.options import argument, option
 from pcdenoise.errors import ScanError, UsageError
 
@@ -57,7 +57,7 @@ def synth(
     if repeated:
         raise UsageError(f"two sources are named {min(repeated)}; rename one or make two data sets")
     index = output / "dataset.json"
-    refuse_existing([index], overwrite)
+    refuse_unwritable([index], overwrite)
     output.mkdir(parents=True, exist_ok=True)
     console = Console(quiet)
     items = []

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pcdenoise.commands import options, outputs
 from pcdenoise.commands.console import Console
-from pcdenoise.commands.files import refuse_existing
+from pcdenoise.commands.files import refuse_unwritable
 from pcdenoise.commands.options import configured, option
 from pcdenoise.errors import UsageError
 
@@ -99,8 +99,8 @@ def train(
         prior=prior, kernel=kernel, alpha=alpha, beta=beta, unit=unit, part_points=part_points, laps=laps,
         steps=steps, budget_s=_seconds(budget), seed=seed, threads=threads,
     )  # fmt: skip
-    refuse_existing([output / "config.json"], overwrite or resume)
-    refuse_existing([report], overwrite)
+    refuse_unwritable([output / "config.json"], overwrite or resume)
+    refuse_unwritable([report], overwrite)
     console = Console(quiet or not ranks.is_first())
     with console.progress("train") as on_progress:
         summary = trainer.train(settings, output, init=init, resume=resume, overwrite=overwrite, on_progress=on_progress)

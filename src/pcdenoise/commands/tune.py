@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pcdenoise.commands import options
 from pcdenoise.commands.console import Console, counted
-from pcdenoise.commands.files import refuse_existing
+from pcdenoise.commands.files import refuse_unwritable
 from pcdenoise.commands.options import argument, option
 from pcdenoise.errors import ScanError, UsageError
 
@@ -33,7 +33,7 @@ def tune(
     from pcdenoise.evaluation.output import write_whole
     from pcdenoise.learning.scans import noisy_and_clean
 
-    refuse_existing([output], overwrite)
+    refuse_unwritable([output], overwrite)
     for path in data:
         if not path.exists():
             raise ScanError(f"{path}: no such file or folder; check the path")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pcdenoise.commands import options
-from pcdenoise.commands.files import format_of, refuse_existing
+from pcdenoise.commands.files import format_of, refuse_unwritable
 from pcdenoise.errors import ScanError
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def undo(
     from pcdenoise import io
 
     target = Path(output)
-    refuse_existing([target], overwrite)
+    refuse_unwritable([target], overwrite)
     scan = restored(io.read(clean, format=format_of(clean, format)))
     io.write(scan, target, format=format_of(target, format), overwrite=overwrite)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from pcdenoise.errors import ScanError
+from pcdenoise.errors import ScanError, cannot_be_written
 from pcdenoise.whole_files import replaced
 
 
@@ -18,4 +18,4 @@ def write_whole(path: str | os.PathLike[str], data: bytes, *, overwrite: bool) -
         with replaced(target) as file:
             file.write(data)
     except OSError as fault:
-        raise ScanError(f"{path}: cannot be written ({fault.strerror}); check the folder, its permissions and space") from None
+        raise cannot_be_written(path, fault) from None

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from pcdenoise.errors import ScanError
+from pcdenoise.errors import ScanError, cannot_be_written
 from pcdenoise.whole_files import replaced
 
 Raw = bytes | mmap.mmap
@@ -112,7 +112,7 @@ def written(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[Binary
             if target.exists():
                 _check_target(path, target, overwrite)
     except OSError as fault:
-        raise ScanError(f"{path}: cannot be written ({fault.strerror}); check the folder's permissions and free space") from None
+        raise cannot_be_written(path, fault) from None
 
 
 def _check_target(path: str | os.PathLike[str], target: Path, overwrite: bool) -> None:
@@ -144,4 +144,4 @@ def _spooled(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             if isinstance(fault, BrokenPipeError) and os.fspath(path) == STREAM:
                 raise
             where = "stdout" if os.fspath(path) == STREAM else path
-            raise ScanError(f"{where}: cannot be written ({fault.strerror}); check where it leads") from None
+            raise cannot_be_written(where, fault, check="where it leads") from None
