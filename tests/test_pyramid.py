@@ -29,7 +29,7 @@ def ordered(points: np.ndarray) -> np.ndarray:
 def in_torch(model: Model, *given: Any, **options: Any) -> tuple[np.ndarray, np.ndarray]:
     with torch.no_grad():
         descent = pyramid.descend(model.network, *given, **options)
-    return (descent.seeds[-1] if descent.landed is None else descent.landed).numpy(), descent.shape.numpy()
+    return descent.last.numpy(), descent.shape.numpy()
 
 
 def compiled(model: Model, *given: Any, **options: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -129,8 +129,7 @@ def _in_torch(
     assert isinstance(model.network, ProjectionNetwork)
     with _torch_threads(1), torch.no_grad():  # of blocks, which are spread over threads already
         descent = descend(model.network, seeds, count, raw, *noise, threads=threads, on_block=on_block)
-    landed = descent.seeds[-1] if descent.landed is None else descent.landed
-    return landed.numpy(), descent.shape.numpy()
+    return descent.last.numpy(), descent.shape.numpy()
 
 
 def mcconv(points: Points, unit: float, model: Model, seeds: Sequence[int], threads: int, on_share: OnShare) -> Points:

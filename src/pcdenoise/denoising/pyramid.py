@@ -43,6 +43,16 @@ class Descent:
     shape: Tensor
     landed: Tensor | None
 
+    @property
+    def last(self) -> Tensor:
+        """(F, 3) where the raw points are in the end, or the seeds where every point is its own."""
+        return self.seeds[-1] if self.landed is None else self.landed
+
+    @property
+    def earlier(self) -> list[Tensor]:
+        """(M, 3) places of the seeds after every stage that others follow."""
+        return self.seeds[:-1] if self.landed is None else self.seeds
+
 
 def descend(
     network: ProjectionNetwork,

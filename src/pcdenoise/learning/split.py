@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pcdenoise.cloud.neighbours import principal_axes
+from pcdenoise.cloud.blocks import each_block
+from pcdenoise.cloud.neighbours import NeighbourSearch, principal_axes, spatial_order
 from pcdenoise.denoising.pyramid import descend
 from pcdenoise.learning.dataset import Array, Mask, TrainingCloud
 from pcdenoise.learning.supervised import robust
@@ -21,6 +21,7 @@ _REACH_STDS = 4.5
 """The cylinder is as wide as the ball in which the noise shows a surface (cloud.noise_level), and never holds fewer points."""
 _HEIGHT_STDS = 4.0
 _FIT_PARAMETERS = 6
+_BLOCK = 256  # places: what is known of their neighbours fits the cache
 
 
 def split_loss(network: ProjectionNetwork, cloud: TrainingCloud) -> tuple[Tensor, Tensor]:
@@ -31,33 +32,37 @@ def split_loss(network: ProjectionNetwork, cloud: TrainingCloud) -> tuple[Tensor
     that the expected loss is the squared error plus the fit's variance, whatever the network does; the quadric takes curvature
     off, and what is left of it is the -Hσ² of every fit to points that also err along the surface.
     """
-    run = descend(network, *cloud.given, block_points=10**9, threads=1)
-    steps = [points.float() for points in run.seeds]
-    final = steps[-1] if run.landed is None else run.landed.float()
-    target, loss = HeldOut(cloud.held_out, cloud.noise), torch.zeros(())
-    for points in steps if run.landed is not None else steps[:-1]:
-        height, known = target.heights(points[torch.from_numpy(cloud.seed_judged)])
-        if known.any():
-            loss = loss + 0.3 * robust(height[known].abs() / cloud.scale)
-    height, known = target.heights(final[torch.from_numpy(cloud.on_surface)])
-    if not known.any():
+    run, target = descend(network, *cloud.given, block_points=10**9, threads=1), HeldOut(cloud.held_out, cloud.noise)
+    loss = torch.zeros(())
+    for points in run.earlier:
+        height = target.known_heights(points.float(), cloud.seed_judged)
+        if len(height):
+            loss = loss + 0.3 * robust(height.abs() / cloud.scale)
+    height = target.known_heights(run.last.float(), cloud.on_surface)
+    if not len(height):
         return torch.full((), torch.nan), torch.full((), torch.nan)
-    error = height[known].abs() / cloud.scale
+    error = height.abs() / cloud.scale
     return loss + robust(error), error.square().mean()
 
 
 def held_out_error(network: ProjectionNetwork, cloud: TrainingCloud) -> float:
     """The error of `split_loss` on a cloud, for comparing weights without truth; NaN where too little is held out."""
     with torch.no_grad():
-        return float(split_loss(network, cloud)[1])
+        last = descend(network, *cloud.given).last
+    height = HeldOut(cloud.held_out, cloud.noise, threads=-1).known_heights(last.float(), cloud.on_surface)
+    return float((height / cloud.scale).square().mean())
 
 
 class HeldOut:
     """Heights of points over the quadrics through (H, 3) held-out points near them, under noise of standard deviation `noise`."""
 
-    def __init__(self, points: Array, noise: float) -> None:
-        self._points, self._noise = points, noise
-        self._tree = cKDTree(points)
+    def __init__(self, points: Array, noise: float, threads: int = 1) -> None:
+        self._points, self._noise, self._threads = points[spatial_order(points)], noise, threads
+
+    def known_heights(self, points: Tensor, judged: Mask) -> Tensor:
+        """(K,) heights, with gradient, of those of the judged (M, 3) points around which the fit holds."""
+        height, known = self.heights(points[torch.from_numpy(judged)])
+        return height[torch.from_numpy(known)]
 
     def heights(self, points: Tensor) -> tuple[Tensor, Mask]:
         """(M,) signed heights of (M, 3) points, with gradient, and (M,) where enough points lie around and agree on a surface."""
@@ -68,10 +73,18 @@ class HeldOut:
 
     def _feet(self, place: Array) -> tuple[Array, Array, Mask]:
         """(M, 3) points of the fitted surface over or under each place, (M, 3) normals, (M,) where the fit holds."""
-        if len(place) == 0 or len(self._points) < _POINTS:
-            return place, np.zeros_like(place), np.zeros(len(place), dtype=bool)
-        distances, index = self._tree.query(place, k=min(4 * _POINTS, len(self._points)))
-        near = self._points[index]
+        foot, normal, known = place.copy(), np.zeros_like(place), np.zeros(len(place), dtype=bool)
+        if len(place) and len(self._points) >= _POINTS:
+            distances, index = NeighbourSearch(self._points, self._threads).knn(place, 4 * _POINTS)
+
+            def fit(rows: slice) -> None:
+                foot[rows], normal[rows], known[rows] = self._fitted(place[rows], self._points[index[rows]], distances[rows])
+
+            each_block(fit, len(place), self._threads, _BLOCK)
+        return foot, normal, known
+
+    def _fitted(self, place: Array, near: Array, distances: Array) -> tuple[Array, Array, Mask]:
+        """The same from (M, K, 3) points around and their (M, K) distances, in ascending order."""
         wide = np.maximum(distances[:, _POINTS - 1], _REACH_STDS * self._noise)
         inside = distances <= wide[:, None]
         centre = (near * inside[:, :, None]).sum(axis=1) / inside.sum(axis=1)[:, None]

@@ -36,12 +36,11 @@ def supervised_loss(network: ProjectionNetwork, cloud: TrainingCloud) -> tuple[T
     """Loss to descend and the final mean squared error, both relative to the noise of the cloud, whose surface is known."""
     assert cloud.surface is not None
     run = descend(network, *cloud.given, block_points=10**9, threads=1)
-    steps = [points.float() for points in run.seeds]
     target, loss = NearestSurface(cloud.surface), torch.zeros(())
-    for points in steps if run.landed is not None else steps[:-1]:
-        loss = loss + 0.3 * robust(target.error(points[torch.from_numpy(cloud.seed_judged)]) / cloud.scale)
+    for points in run.earlier:
+        loss = loss + 0.3 * robust(target.error(points.float()[torch.from_numpy(cloud.seed_judged)]) / cloud.scale)
     start = torch.from_numpy(cloud.seeds if cloud.raw is None else cloud.raw).float()
-    final = steps[-1] if run.landed is None else run.landed.float()
+    final = run.last.float()
     on_surface, still = torch.from_numpy(cloud.on_surface), torch.from_numpy(cloud.judged & cloud.clutter)
     error = target.error(final[on_surface]) / cloud.scale
     loss = loss + robust(error)
