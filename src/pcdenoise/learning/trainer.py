@@ -40,6 +40,7 @@ _ADAPTING_RATE = 3e-4  # peak learning rate for a model that has learned already
 _OWN_LAW = {True: 0.8, False: 0.1}
 """How often distillation puts back a scan's own noise and a synthetic cloud's, rather than a law of synthesis."""
 _JUDGED_CLOUDS = 16
+_FEW_STEPS = 4  # whose clouds are made sooner than a process that makes clouds is there
 _FIRST_LAP = 0.2
 """Share of a distillation whose teacher has learned nothing yet; the laps after it are equally long."""
 
@@ -101,7 +102,8 @@ def _trained(run: Run, adapts: bool, resume: bool, on_progress: OnProgress) -> T
                 until = 1.0 if lap + 1 == lessons.laps else _FIRST_LAP + (1 - _FIRST_LAP) * lap / (lessons.laps - 1)
                 if run.progress >= until:
                     continue
-                first, n_makers = ranks.number(run.step), ranks.n_makers(config.threads)
+                few = config.steps is not None and config.steps - run.step <= _FEW_STEPS
+                first, n_makers = ranks.number(run.step), 0 if few else ranks.n_makers(config.threads)
                 series = lessons.source(lap, run).clouds(first, _neighbours(run.network), stride=ranks.count, n_makers=n_makers)
                 with closing(series) as clouds:  # who makes them must be gone before what they keep them in is
                     for cloud in clouds:
