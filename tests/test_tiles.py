@@ -19,7 +19,7 @@ from pcdenoise.cloud.scan import Scan
 from pcdenoise.commands import main
 from pcdenoise.commands.memory import LEAST, n_bytes
 from pcdenoise.config import DenoiseConfig
-from pcdenoise.denoising import denoiser, tiles
+from pcdenoise.denoising import cells, denoiser
 from pcdenoise.denoising.tiles import Tiles
 from pcdenoise.errors import UsageError
 from pcdenoise.synthesis.noise import heavy_tailed
@@ -115,7 +115,7 @@ def test_cells_give_what_the_whole_gives_of_odd_clouds(name: str, tmp_path: Path
 def test_a_rim_is_needed_for_that(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     noisy = cloud("torus", 5000, 0.5)
     whole = denoiser.denoise(noisy.noisy, model("seeded"), DenoiseConfig(threads=1))
-    monkeypatch.setattr(tiles, "_RIM_RADII", 0.3)
+    monkeypatch.setattr(cells, "_RIM_RADII", 0.3)
     moved, _ = cleaned_in_cells(noisy.noisy, tmp_path / "cells", DenoiseConfig(threads=1), 1000)
     assert np.abs(moved - whole.points).max() > 0.01 * noisy.spacing
 
@@ -257,3 +257,45 @@ def test_cells_are_as_large_as_asked_for_where_many_points_share_a_place(rng: np
     sizes = [(tmp_path / "cells" / "start" / f"{cell}.i8").stat().st_size // 8 for cell in job.cells]
     assert sum(sizes) == len(points)
     assert max(sizes) < 2000
+
+
+def dense_on_sparse(rng: np.random.Generator) -> np.ndarray:
+    """(24000, 3) a ball of 20,000 points, spacing about 0.012, on a floor whose points are half a unit apart."""
+    ball = rng.normal(size=(20_000, 3))
+    ball *= 0.5 / np.linalg.norm(ball, axis=1, keepdims=True)
+    floor = np.column_stack([rng.uniform(-16, 16, (4000, 2)), np.full(4000, -0.5)])
+    return np.concatenate([ball, floor]) + rng.normal(0, 0.003, (24_000, 3))
+
+
+def test_a_sparse_cell_does_not_take_all_that_is_dense_beside_it(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points, config = dense_on_sparse(rng), DenoiseConfig(threads=1)
+    monkeypatch.setattr(cells, "_MEDIUM_TILE", 1000)
+    moved, job = cleaned_in_cells(points, tmp_path / "cells", config, 2000)
+    # In spacings: 2000 points in a cell of twice its width, nine rings of the 33 nearest, 3.24 wide each, around it:
+    # (63 + 2 · 29) · (32 + 2 · 29) = 11,000; cells are up to a tenth larger than asked for. The whole has 24,000.
+    assert max(len(job._tile(cell, 0)[1].points) for cell in job.cells) < 13_000
+    whole = denoiser.denoise(points, model("seeded"), config)
+    off = np.linalg.norm(moved - whole.points, axis=1) / whole.figures["noise"]
+    # What is as noisy as it is sparse is looked at in wider neighbourhoods than nine rings hold: a few points of the floor.
+    assert np.quantile(off, 0.995) < 1e-3
+
+
+def test_what_is_nearest_on_disk_is_nearest_in_all(tmp_path: Path, rng: np.random.Generator) -> None:
+    points = dense_on_sparse(rng)[::4]
+    points = np.concatenate([points, np.round(points[:500], 2)])
+    job = Tiles(tmp_path / "cells", lambda: [points], model("seeded"), DenoiseConfig(threads=1), 700, {})
+    everything = np.concatenate([job.cells.part(cell, 0).points for cell in job.cells])
+    centres = everything[:: len(everything) // 20]
+    for k in (1, 40, len(everything) + 1):
+        near, distances, rows = job.cells.nearest(centres, k, 0)
+        apart = np.sort(np.linalg.norm(everything[None] - centres[:, None], axis=2), axis=1)[:, :k]
+        np.testing.assert_allclose(distances, apart, atol=1e-12)
+        np.testing.assert_allclose(np.linalg.norm(near.points[rows] - centres[:, None], axis=2), distances, atol=1e-12)
+    around = job.cells.around(centres[3], 300)
+    assert len(around.points) == 300
+    assert np.isclose(
+        np.linalg.norm(around.points - centres[3], axis=1).max(), np.sort(np.linalg.norm(everything - centres[3], axis=1))[299]
+    )
+    assert len(job.cells.around(centres[3], 10**9).points) == len(everything)

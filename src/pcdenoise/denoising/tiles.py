@@ -1,7 +1,7 @@
 """Clouds larger than memory: cells on disk, each cleaned with what lies around it, so that a tile gives what the whole gives.
 
-Here: the cells, their surroundings, what is kept for a later `resume`. Not here: where space is cut (cuts.py), scan files (io),
-one pass (denoiser.py).
+Here: what is done with each cell, and what is kept for a later `resume`. Not here: where space is cut (cuts.py), cells and their
+surroundings (cells.py), scan files (io), one pass (denoiser.py).
 
 All that is global in a pass is found first, streaming, exactly as it is found in memory: the frame's origin, the probes and the
 noise level they read, the stop rule. The rest is local, and every draw is a hash of a point's place in the file, so a cell needs
@@ -36,17 +36,15 @@ from pcdenoise.cloud import drift
 from pcdenoise.cloud.neighbours import (
     Distances,
     Identity,
-    NeighbourSearch,
     coordinate_hash,
     distinct_by,
     drawn_by,
-    nearest_to,
-    spatial_order,
 )
 from pcdenoise.cloud.noise_level import N_PROBES, NoiseLevel, by_place, estimate_from
 from pcdenoise.cloud.scan import Mask, Points, check_extent
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import classical, denoiser, outliers, risk, taken_off, uncertainty
+from pcdenoise.denoising.cells import Cells, Part, share_of_own
 from pcdenoise.denoising.cuts import by_cell, cell_of, cuts_of, number_of_cells
 from pcdenoise.denoising.denoiser import Progress
 from pcdenoise.denoising.seeds import share_of_seeds
@@ -56,15 +54,8 @@ from pcdenoise.whole_files import replaced
 BASE_BYTES, POINT_BYTES = 400 << 20, 1100
 """Memory of the program itself, and of each point of the part that is being cleaned: measured where torch
 runs the network, with a tenth to spare; compiled code takes three quarters of it."""
-_CORE_SHARE = 0.47  # of a tile's points are the cell's own, the others its rim
-_RIM_RADII = 6.5
-"""Width of the rim in radii of the network's neighbourhoods. A pass reaches eight radii at most, but a neighbour's weight is zero
-at one radius, so that what lies beyond five does not reach a thousandth of the noise (a test measures it); and where a place is
-noisier than the cloud, neighbourhoods are wider, by up to a half."""
 _RIM_NEIGHBOURS = 24
 _LARGER_CELLS = 1.5  # than asked for are still gone on with: how much memory is free changes from run to run
-_SAMPLED = 256
-_FEWEST_IN_TILE = 512
 _GATHERED = (192, 2048)  # neighbours kept of each probe: most clouds show their surface within the first
 _N_LENGTHS = 1_000_000
 
@@ -85,7 +76,7 @@ def needed_bytes(n_points: int) -> int:
 
 def points_per_cell(max_bytes: int) -> int:
     """How many points a cell may have, so that it is cleaned within so much memory."""
-    return max(10_000, int(_CORE_SHARE * (max_bytes - BASE_BYTES) / POINT_BYTES))
+    return max(10_000, share_of_own((max_bytes - BASE_BYTES) // POINT_BYTES))
 
 
 @dataclass(frozen=True)
@@ -96,14 +87,6 @@ class Rows:
     outlier: Mask
     unmoved: Mask
     std: NDArray[np.float64] | None = None
-
-
-@dataclass(frozen=True)
-class _Part:
-    """Distinct points in the order of their hashes: where they are after some pass (n, 3), and identity (n,)."""
-
-    points: Points
-    identity: Identity
 
 
 class _Smallest:
@@ -206,10 +189,11 @@ class Tiles:
             return None
         return plan if same else None
 
-    @property
-    def cells(self) -> range:
-        """The cells' numbers."""
-        return range(self.plan["n_cells"])
+    @cached_property
+    def cells(self) -> Cells:
+        """The distinct points, cell by cell."""
+        plan, low = self.plan, np.array(self.plan["low"])
+        return Cells(self.folder, plan["n_cells"], plan["n_distinct"], plan["cell_points"], low, plan["extent"], self.threads)
 
     def run(self, on_progress: Progress = lambda _task, _share: None) -> None:
         """All passes over all cells, and the figures of a `denoiser.Result`."""
@@ -303,7 +287,7 @@ class Tiles:
         probed, keys = np.array(plan["probes"]).reshape(-1, 3), np.array(plan["probe_keys"], np.uint64)
         home: dict[bytes, int] = {}
         for cell, those in by_cell(cell_of(probed, plan["cuts"])):
-            part = self._part(cell, number)
+            part = self.cells.part(cell, number)
             drawn = drawn_by(part.identity, self.config.seed)
             order = np.argsort(drawn)
             probed[those] = part.points[order[np.searchsorted(drawn, keys[those], sorter=order)]]
@@ -316,10 +300,12 @@ class Tiles:
             if missing.any():
                 most = min(next(n for n in _GATHERED if n >= k), plan["n_distinct"])
                 cells = np.array([home[centre.tobytes()] for centre in centres[missing]])
-                for cell, those in by_cell(cells):
+                for _, those in by_cell(cells):
                     asked = centres[missing][those]
-                    distances, near = self._nearest(asked, cell, number, most)
-                    kept.update({centre.tobytes(): pair for centre, *pair in zip(asked, distances, near, strict=True)})
+                    near, distances, rows = self.cells.nearest(asked, most, number)
+                    kept.update(
+                        {centre.tobytes(): pair for centre, *pair in zip(asked, distances, near.points[rows], strict=True)}
+                    )
             pairs = [kept[centre.tobytes()] for centre in centres]
             return np.stack([distances[:k] for distances, _ in pairs]), np.stack([near[:k] for _, near in pairs])
 
@@ -327,59 +313,26 @@ class Tiles:
         self._gathered = {}
         if number == 0:
             model = self.model if self.config.method == "network" else None
-            found = taken_off.level_by(found, probed, self._around, model, self.config.seed, self.threads)
+            found = taken_off.level_by(found, probed, self._sample, model, self.config.seed, self.threads)
         _write(path, json.dumps(asdict(found)).encode())
         return found
 
-    def _nearest(self, centres: Points, cell: int, number: int, k: int) -> tuple[Distances, Points]:
-        """(M, k) distances and (M, k, 3) positions of the points nearest to some of a cell; the rim grows until they are."""
-        low, high = centres.min(axis=0), centres.max(axis=0)
-        own = self._part(cell, number).points
-        margin = 1.5 * float(NeighbourSearch(own, self.threads).knn(centres, min(k, len(own)))[0].max())
-        margin = max(margin, 1e-3 * self.plan["extent"], np.finfo(np.float64).tiny)
-        while True:
-            near = np.concatenate([own, *(part.points for part in self._rim(cell, number, low - margin, high + margin))])
-            if len(near) >= k:
-                near = near[self._order(near)]
-                distances, indices = NeighbourSearch(near, self.threads).knn(centres, k)
-                if distances.max() <= margin or len(near) == self.plan["n_distinct"]:
-                    return distances, near[indices]
-                margin = max(1.01 * float(distances.max()), margin)
-            margin *= 2
-
-    def _order(self, points: Points) -> NDArray[np.int64]:
-        """(N,) the order in which the whole cloud has these points."""
-        return spatial_order(points, (np.array(self.plan["low"]), self.plan["extent"]))
-
     def _judge(self, level: NoiseLevel) -> denoiser.Judge:
         """The points that stand for the whole cloud: those nearest to the first of all probes, as in memory."""
-        points, identity = self._around(np.array(self.plan["probes"][0]), risk.MOST_POINTS)
+        points, identity = self._sample(np.array(self.plan["probes"][0]), risk.MOST_POINTS)
         some = risk.Risk(points, identity, level.as_read, self.config.seed, self.threads)
         return denoiser.Judge(some, level, self.plan["diagonal"], self.model, self.config, self.threads)
 
-    def _around(self, centre: Points, most: int) -> taken_off.Sample:
-        """So many points nearest to a place, as they are in the file."""
-        most = min(most, self.plan["n_distinct"])
-        cell = int(cell_of(centre[None], self.plan["cuts"])[0])
-        part = self._part(cell, 0)
-        margin = max(float(np.ptp(part.points, axis=0).max()), 1e-12)
-        while True:
-            tile = _joined([part, *self._rim(cell, 0, centre - margin, centre + margin)])
-            distance = np.linalg.norm(tile.points - centre, axis=1)
-            if len(tile.points) == self.plan["n_distinct"] or (distance <= margin).sum() >= most:
-                break
-            margin *= 1.5
-        nearest = nearest_to(centre, tile.points, tile.identity, most)
-        tile = _Part(tile.points[nearest], tile.identity[nearest])
-        order = self._order(tile.points)
-        return tile.points[order], tile.identity[order]
+    def _sample(self, centre: Points, most: int) -> taken_off.Sample:
+        around = self.cells.around(centre, most)
+        return around.points, around.identity
 
     def _drift(self, cell: int, number: int) -> tuple[int, float, float]:
         """How many points a cell has, and how far its surface moved in all passes, at all and inward."""
         path = self.folder / "drift" / f"{cell}.json"
         if not path.is_file():
-            start = self._part(cell, 0).points
-            moved = start if number == 0 else denoiser.limited(start, self._part(cell, number).points, self.config)
+            start = self.cells.part(cell, 0).points
+            moved = start if number == 0 else denoiser.limited(start, self.cells.part(cell, number).points, self.config)
             found = drift.measure(start, moved, self.config.seed, self.threads)
             _write(path, json.dumps([len(start), found.size, found.inward]).encode())
         n, size, inward = json.loads(path.read_text())
@@ -391,7 +344,7 @@ class Tiles:
         if path.is_file():
             return
         own, tile = self._tile(cell, number - 1)
-        order = self._order(tile.points)
+        order = self.cells.order(tile.points)
         moved = denoiser.one_pass(
             tile.points[order], tile.identity[order], level, self.plan["diagonal"], self.model, self.config, self.threads
         )
@@ -404,7 +357,7 @@ class Tiles:
         path = self.folder / "outliers" / f"{cell}.u1"
         if not path.is_file():
             own, tile = self._tile(cell, 0)
-            order = self._order(tile.points)
+            order = self.cells.order(tile.points)
             found = np.zeros(len(order), bool)
             found[order] = outliers.find(tile.points[order], level=level, threads=self.threads)
             _write(path, found[: len(own.points)].tobytes())
@@ -418,32 +371,17 @@ class Tiles:
         std = np.full(len(own.points), np.nan)
         if level.is_surface:
             measured, around = self._tile(cell, 0)
-            order, noise = self._order(around.points), np.empty(len(around.points))
+            order, noise = self.cells.order(around.points), np.empty(len(around.points))
             noise[order] = by_place(around.points[order], around.identity[order], level, self.threads)
-            start, cleaned = measured.points, tile.points[self._order(tile.points)]
+            start, cleaned = measured.points, tile.points[self.cells.order(tile.points)]
             final = start if number == 0 else denoiser.limited(start, own.points, self.config)
             std = uncertainty.estimate(cleaned, start, own.points, final, noise[: len(start)], self.threads)
         _write(path, std.tobytes())
 
-    def _tile(self, cell: int, number: int) -> tuple[_Part, _Part]:
+    def _tile(self, cell: int, number: int) -> tuple[Part, Part]:
         """A cell's own points after a pass, and these followed by its rim."""
-        own = self._part(cell, number)
-        if not len(own.points):
-            return own, own
-        low, high = own.points.min(axis=0), own.points.max(axis=0)
-        ordered = own.points[self._order(own.points)]
         level = self.level(number)
-        k = min(len(ordered), 1 + self._neighbours(level))
-        some = ordered[:: max(1, len(ordered) // _SAMPLED)]
-        radius = float(np.quantile(NeighbourSearch(ordered, self.threads).knn(some, k)[0][:, -1], 0.9))
-        margin = max(_RIM_RADII * radius, self._ball(level), 1e-12)
-        while True:
-            rim = list(self._rim(cell, number, low - margin, high + margin))
-            n = len(own.points) + sum(len(part.points) for part in rim)
-            if n >= min(_FEWEST_IN_TILE, self.plan["n_distinct"]):
-                break
-            margin *= 2
-        return own, _joined([own, *rim])
+        return self.cells.tile(cell, number, 1 + self._neighbours(level), self._ball(level))
 
     def _neighbours(self, level: NoiseLevel) -> int:
         """How many nearest points a pass looks at, at that noise."""
@@ -461,28 +399,6 @@ class Tiles:
             return 0.0
         return classical.ball_radius(level) if self.config.radius is None else self.config.radius * self.plan["diagonal"]
 
-    def _rim(self, cell: int, number: int, low: Points, high: Points) -> Iterator[_Part]:
-        """The points of all other cells in a box after a pass."""
-        for other in self.cells:
-            if other != cell:
-                its_low, its_high = self._box(other, number)
-                if (its_low <= high).all() and (its_high >= low).all():
-                    part = self._part(other, number)
-                    inside = ((part.points >= low) & (part.points <= high)).all(axis=1)
-                    if inside.any():
-                        yield _Part(part.points[inside], part.identity[inside])
-
-    def _box(self, cell: int, number: int) -> tuple[Points, Points]:
-        if (cell, number) not in self._boxes:
-            points = self._part(cell, number).points
-            empty = np.full(3, np.inf), np.full(3, -np.inf)
-            self._boxes[cell, number] = (points.min(axis=0), points.max(axis=0)) if len(points) else empty
-        return self._boxes[cell, number]
-
-    @cached_property
-    def _boxes(self) -> dict[tuple[int, int], tuple[Points, Points]]:
-        return {}
-
     def _sort(self, cell: int) -> int:
         """Leaves one row for each place of a cell, in the order of the hashes; how many there are."""
         path = self.folder / "start" / f"{cell}.f64"
@@ -492,21 +408,13 @@ class Tiles:
         _write(path.with_suffix(".i8"), place.astype(np.int64).tobytes())
         return len(first)
 
-    def _part(self, cell: int, number: int) -> _Part:
-        """The distinct points of a cell after so many passes."""
-        rows = np.fromfile(self.folder / "start" / f"{cell}.f64").reshape(-1, 4)
-        identity = np.ascontiguousarray(rows[:, 3]).view(np.uint64)
-        if number == 0:
-            return _Part(np.ascontiguousarray(rows[:, :3]), identity)
-        return _Part(np.fromfile(self.folder / f"pass_{number}" / f"{cell}.f64").reshape(-1, 3), identity)
-
     def _finish(self, cell: int, number: int) -> None:
         """Writes the new places of a cell's rows, in file order; nothing if that is done already."""
         path = self.folder / "done" / f"{cell}.f64"
         if path.is_file():
             return
-        start = self._part(cell, 0).points
-        moved = start if number == 0 else denoiser.limited(start, self._part(cell, number).points, self.config)
+        start = self.cells.part(cell, 0).points
+        moved = start if number == 0 else denoiser.limited(start, self.cells.part(cell, number).points, self.config)
         done = np.zeros((len(start), 4 + self.config.uncertainty))
         done[:, :3], done[:, 3] = moved, 2 * (moved == start).all(axis=1)
         if self.config.outliers != "keep":
@@ -518,10 +426,6 @@ class Tiles:
     def remove(self) -> None:
         """Removes the work folder."""
         shutil.rmtree(self.folder, ignore_errors=True)
-
-
-def _joined(parts: list[_Part]) -> _Part:
-    return _Part(np.concatenate([part.points for part in parts]), np.concatenate([part.identity for part in parts]))
 
 
 def _write(path: Path, data: bytes) -> None:
