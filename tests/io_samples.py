@@ -208,6 +208,7 @@ XYZ = {
     "header in another order": b"Intensity,Z,Y,X\r\n7,3.1,2.2,1.3\r\n8,6.1,5.2,4.3\r\n9,9.1,8.2,7.3\r\n",
     "quotes": b'"X","Y","Z","name"\n1.5,2.5,3.5,"a, b"\n4.5,5.5,6.5,"c"\n7.5,8.5,9.5,d\n',
     "semicolons": b"x;y;z;r;g;b\n1.5;2.5;3.5;255;0;1\n4.5;5.5;6.5;2;3;4\n7.5;8.5;9.5;5;6;7\n",
+    "decimal commas": b"x;y;z;i\n1,5;2,5;3,5;1\n4,5;5,5;6,5;2\n7,5;8,5;9,5;3\n",
     "tabs": b"1.5\t2.5\t3.5\tleaf\n4.5\t5.5\t6.5\t\n7.5\t8.5\t9.5\twood chip\n",
     "comments and blanks": b"# station 7\n\n# x y z i\n1.5 2.5 3.5 1\n\n  // moved\n4.5 5.5 6.5 2\n7.5 8.5 9.5 3\n\n",
     "cloudcompare": b"//X Y Z R G B\n3\n1.5 2.5 3.5 1 2 3\n4.5 5.5 6.5 4 5 6\n7.5 8.5 9.5 7 8 9\n",

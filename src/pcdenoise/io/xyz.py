@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, BinaryIO
@@ -12,31 +11,16 @@ import numpy as np
 from pcdenoise.cloud.scan import Mask, Points, Scan
 from pcdenoise.errors import ScanError
 from pcdenoise.io.files import Raw, check_not_cut, let_go
-from pcdenoise.io.lines import Octets, Offsets, find_lines, first_visible, is_number, split_fields
+from pcdenoise.io.lines import Octets, find_lines, first_visible, is_number
 from pcdenoise.io.source import Column, changed, colours_as_bytes, exactly, moved_rows, portable, step_decimals
 from pcdenoise.io.source import is_number as holds_numbers
 from pcdenoise.io.text import NewFields, TextRows, coordinate_form, coordinates, plain
+from pcdenoise.io.xyz_header import AXES, Layout, axis_of, unique
 
-_DELIMITERS = (ord(";"), ord(","), ord("\t"), None)
-_COMMENTS = (b"#", b"//")
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
-_BOM = b"\xef\xbb\xbf"
-_AXES: tuple[Mapping[str, str], ...] = (
-    {"x": "x", "y": "y", "z": "z"},
-    {
-        **dict.fromkeys(("e", "east", "easting", "x_coord", "xcoord", "coord_x", "x coordinate"), "x"),
-        **dict.fromkeys(("n", "north", "northing", "y_coord", "ycoord", "coord_y", "y coordinate"), "y"),
-        **dict.fromkeys(
-            ("h", "height", "elev", "elevation", "alt", "altitude", "z", "z_coord", "zcoord", "coord_z", "z coordinate"), "z"
-        ),
-    },
-)
-"""What columns are called that hold coordinates; the first set that is complete counts."""
 _FEWEST_COUNTED, _MOST_COUNTED = 20, 4096
 _NEW_FILE_STEP = 1e-9
-_MOST_TITLES = 1000
 _MOST_COLUMNS = 4096
-_LONGEST_LINE = 1 << 17
 _STREAM_HEAD = 4 << 20
 
 
@@ -47,6 +31,7 @@ class XyzSource:
     indices    attribute name -> column.
     names_end  offset in `head` past the line that names the columns, if one does.
     count      span in `head` of a .pts file's point count, if there is one.
+    decimal_comma  whether the file has commas where `rows` has decimal points; then it has no points there.
     """
 
     head: bytes
@@ -57,6 +42,7 @@ class XyzSource:
     indices: Mapping[str, int]
     names_end: int | None
     count: tuple[int, int] | None
+    decimal_comma: bool = False
 
     def points(self) -> Points:
         """(N, 3) coordinates as read."""
@@ -80,9 +66,7 @@ class XyzSource:
             for name in names:
                 line = line.replace(joint + name.encode(), b"", 1)
             head = head[:start] + line + head[self.names_end :]
-        body = self.rows.without([self.indices[name] for name in names])
-        source: XyzSource = read(head + body.tobytes(), self.rows.origin).source
-        return source
+        return self._with(head, self.rows.without([self.indices[name] for name in names]))
 
     def selected(self, keep: Mask) -> XyzSource:
         """The file with only these lines, its count line corrected. Raises ScanError if none is left."""
@@ -91,7 +75,14 @@ class XyzSource:
         head = self.head
         if self.count is not None:
             head = head[: self.count[0]] + str(int(keep.sum())).encode() + head[self.count[1] :]
-        source: XyzSource = read(head + self.rows.selected(keep).body.tobytes(), self.rows.origin).source
+        return self._with(head, self.rows.selected(keep).body)
+
+    def as_written(self, body: bytes) -> bytes:
+        """Bytes of rows as the file has them."""
+        return body.replace(b".", b",") if self.decimal_comma else body
+
+    def _with(self, head: bytes, body: Octets) -> XyzSource:
+        source: XyzSource = read(head + self.as_written(body.tobytes()), self.rows.origin).source
         return source
 
 
@@ -111,7 +102,7 @@ def read(raw: bytes, origin: str) -> Scan:
         raise ScanError(f"{origin}: is binary or UTF-16, not text; name its real format or save it as UTF-8")
     octets = np.frombuffer(raw, np.uint8)
     starts, ends = find_lines(octets)
-    layout = _Layout.of(raw, first_visible(octets, starts, ends), ends, origin)
+    layout = Layout.of(raw, first_visible(octets, starts, ends), ends, origin)
     body_start = int(starts[layout.first_row])
     rows = _rows(octets[body_start:], layout, origin, layout.first_row + 1)
     if layout.n_claimed > len(rows):
@@ -119,12 +110,18 @@ def read(raw: bytes, origin: str) -> Scan:
     axes, names = _named(rows, layout, origin)
     points, columns = _columns(rows, axes, names)
     indices = {name: names.index(name) for name in columns}
-    source = XyzSource(raw[:body_start], rows, axes, points, columns, indices, layout.names_end, layout.count)
+    head = raw[:body_start]
+    source = XyzSource(head, rows, axes, points, columns, indices, layout.names_end, layout.count, layout.decimal_comma)
     return Scan(points, columns, "xyz", origin, source)
 
 
-def _rows(octets: Octets, layout: _Layout, origin: str, first_line: int) -> TextRows:
-    """The rows among lines that are whole: neither blank nor comments."""
+def _rows(octets: Octets, layout: Layout, origin: str, first_line: int) -> TextRows:
+    """The rows among lines that are whole: neither blank nor comments. Raises ScanError if some numbers have decimal commas and
+    others points."""
+    if layout.decimal_comma:
+        if (octets == ord(".")).any():
+            raise ScanError(f"{origin}: has decimal commas and decimal points; write all of its numbers with points")
+        octets = np.where(octets == ord(","), np.uint8(ord(".")), octets)
     starts, ends = find_lines(octets)
     visible = first_visible(octets, starts, ends)
     first = octets.take(visible, mode="clip") if len(octets) else octets
@@ -133,14 +130,14 @@ def _rows(octets: Octets, layout: _Layout, origin: str, first_line: int) -> Text
     return TextRows(octets, starts[is_row], ends[is_row], layout.delimiter, origin, first_line)
 
 
-def _named(rows: TextRows, layout: _Layout, origin: str) -> tuple[tuple[int, int, int], list[str]]:
+def _named(rows: TextRows, layout: Layout, origin: str) -> tuple[tuple[int, int, int], list[str]]:
     """Where x, y and z stand, and the names of all columns."""
     n_fields = len(rows.first_fields())
     if n_fields > _MOST_COLUMNS:
         raise ScanError(f"{origin}: line {layout.first_row + 1} has {n_fields} columns, more than any scan; is it a point cloud?")
-    names = _unique([*layout.names, *(f"column_{i + 1}" for i in range(len(layout.names), n_fields))][:n_fields])
-    for words in _AXES:
-        found = [_axis(name, words) for name in names]
+    names = unique([*layout.names, *(f"column_{i + 1}" for i in range(len(layout.names), n_fields))][:n_fields])
+    for words in AXES:
+        found = [axis_of(name, words) for name in names]
         if set(words.values()) <= set(found):
             return (found.index("x"), found.index("y"), found.index("z")), names
     if n_fields > 3 and _counts(replace(rows, starts=rows.starts[:_MOST_COUNTED], ends=rows.ends[:_MOST_COUNTED])):
@@ -168,7 +165,7 @@ class XyzStream:
         start = start[: start.rfind(b"\n") + 1]
         octets = np.frombuffer(start, np.uint8)
         starts, ends = find_lines(octets)
-        self.layout = _Layout.of(start, first_visible(octets, starts, ends), ends, origin)
+        self.layout = Layout.of(start, first_visible(octets, starts, ends), ends, origin)
         self.body_start = int(starts[self.layout.first_row])
         self.axes, _ = _named(
             _rows(octets[self.body_start :], self.layout, origin, self.layout.first_row + 1), self.layout, origin
@@ -200,7 +197,7 @@ class XyzStream:
                 self._learn(rows, points)
             head = self.raw[: self.body_start] if at == self.body_start else b""
             names_end = self.layout.names_end if at == self.body_start else None
-            source = XyzSource(head, rows, self.axes, points, {}, {}, names_end, None)
+            source = XyzSource(head, rows, self.axes, points, {}, {}, names_end, None, self.layout.decimal_comma)
             yield Scan(points, {}, "xyz", self.origin, source)
             let_go(self.raw)
             line += int((rows.body == 10).sum())
@@ -276,75 +273,7 @@ def _own(scan: Scan, source: XyzSource, forms: Sequence[str] | None) -> tuple[by
         joint = " " if rows.delimiter is None else chr(rows.delimiter)
         names = "".join(joint + name.replace(joint, "_") for name in columns)
         head = head[: source.names_end] + names.encode() + head[source.names_end :]
-    return head, rows.rewritten([*fields, *(plain(values) for values in columns.values())])
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """What the lines before the first row say; `first_row` is that row's line, counted from 0."""
-
-    first_row: int
-    delimiter: int | None
-    names: list[str]
-    names_end: int | None
-    count: tuple[int, int] | None
-    n_claimed: int
-
-    @classmethod
-    def of(cls, raw: bytes, visible: Offsets, ends: Offsets, origin: str) -> _Layout:
-        """Read on to the first line with three numbers; before it stand only comments, one count and lines without a number."""
-        titles: list[tuple[bytes, int]] = []
-        count: tuple[int, int] | None = None
-        for i, (start, end) in enumerate(zip(visible[:_MOST_TITLES].tolist(), ends[:_MOST_TITLES].tolist(), strict=True)):
-            line = raw[start:end].removeprefix(_BOM)
-            if len(line) > _LONGEST_LINE:
-                raise ScanError(f"{origin}: line {i + 1} has {len(line)} bytes; is it a point cloud?")
-            if line.startswith(_COMMENTS):
-                titles.append((line, end))
-                continue
-            best = max(_DELIMITERS, key=lambda delimiter: sum(map(is_number, split_fields(line, delimiter))))
-            fields = split_fields(line, best)
-            n_numbers = sum(map(is_number, fields))
-            if n_numbers >= 3:
-                names, names_end = _names(titles, best, len(fields))
-                return cls(i, best, names, names_end, count, int(raw[slice(*count)]) if count else 0)
-            if count is None and len(fields) == 1 and line.strip().isdigit() and len(line) < 19:
-                count = (end - len(line), end)
-            elif n_numbers:
-                raise ScanError(f"{origin}: line {i + 1}: needs three numbers with a decimal point; correct or remove it")
-            elif line:
-                titles.append((line, end))
-        raise ScanError(f"{origin}: none of the first {_MOST_TITLES} lines has three numbers; it holds no points as text")
-
-
-def _names(titles: Sequence[tuple[bytes, int]], delimiter: int | None, n_fields: int) -> tuple[list[str], int | None]:
-    """The column names in the last title that has x, y and z among them (or is no comment and has one for each column)."""
-    for line, end in reversed(titles):
-        for candidate in (delimiter, *_DELIMITERS):
-            names = [field.decode("utf-8", "replace") for field in split_fields(line.lstrip(b"#/"), candidate)]
-            complete = len(names) == n_fields and not line.startswith(_COMMENTS)
-            if len(names) <= n_fields and (complete or _names_axes(names)):
-                return names, end
-    return [], None
-
-
-def _names_axes(names: Sequence[str]) -> bool:
-    """Whether all three axes are among the names."""
-    return any(set(words.values()) <= {_axis(name, words) for name in names} for words in _AXES)
-
-
-def _axis(name: str, words: Mapping[str, str]) -> str:
-    """x, y or z for a column that is called by one of the words, a unit in brackets behind it or not; else nothing."""
-    return words.get(re.sub(r"\s*[\[(].*", "", name.strip().lower(), flags=re.DOTALL), "")
-
-
-def _unique(names: Sequence[str]) -> list[str]:
-    found: list[str] = []
-    for name in names:
-        while name in found:
-            name += "_"
-        found.append(name)
-    return found
+    return head, map(source.as_written, rows.rewritten([*fields, *(plain(values) for values in columns.values())]))
 
 
 def _columns(rows: TextRows, axes: tuple[int, int, int], names: Sequence[str]) -> tuple[Points, dict[str, Column]]:
