@@ -283,7 +283,7 @@ def coordinate_form(before: Points, digits: int, exponent: bool) -> str:
 
 
 def fewest_decimals(values: Column) -> int | None:
-    """The fewest decimals, up to 12, that all values have; None if some have more, or all that a float64 of that size can hold."""
+    """The fewest decimals, up to 12, that all values have; None if some have more, or all that float64 can hold there."""
     finest = np.spacing(np.abs(values).max(initial=1e-3))
     for decimals in range(min(13, int(-np.log10(finest)))):
         if all(bool((np.round(some, decimals) == some).all()) for some in (values[:64], values)):
