@@ -27,6 +27,7 @@ _BLOCK_ROWS = 1 << 16
 _LONGEST_NUMBER = 64
 _LONGEST_TEXT = 256
 COORDINATE_STEP = 1e-6
+_EXCHANGED = np.frombuffer(bytes(range(256)).translate(bytes.maketrans(b",.", b".,")), np.uint8)
 _PLAIN = np.array([byte in (9, LF, CR) or (BLANK <= byte < 127 and byte != QUOTE) for byte in range(256)])
 
 
@@ -50,6 +51,7 @@ class TextRows:
     delimiter   the separating byte, or None for runs of blanks.
     origin      the file, for messages.
     first_line  number of the line that `body` starts with.
+    decimal_comma  whether `body` has a point wherever the file has a comma, and a comma wherever it has a point.
     """
 
     body: Octets
@@ -58,6 +60,7 @@ class TextRows:
     delimiter: int | None
     origin: str
     first_line: int
+    decimal_comma: bool = False
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -82,12 +85,15 @@ class TextRows:
         return values
 
     def texts(self, column: ColumnIndex) -> NDArray[Any]:
-        """(N,) fields as strings, cut after 256 bytes."""
+        """(N,) fields as the file has them, as strings, cut after 256 bytes."""
         blocks = [np.empty(0, "S1")]
         for block in self._blocks():
             starts, ends = _Fields.of(self, *block).spans(column)
             blocks.append(_gathered(self.body, starts, np.minimum(ends - starts, _LONGEST_TEXT)))
-        return np.char.decode(np.concatenate(blocks), "utf-8", "replace")
+        fields = np.concatenate(blocks)
+        if self.decimal_comma:
+            fields = commas_for_points(fields.view(np.uint8)).view(fields.dtype)
+        return np.char.decode(fields, "utf-8", "replace")
 
     def decimals(self, column: ColumnIndex) -> tuple[int, bool]:
         """(most digits after the point, whether all have an exponent), from up to 4096 evenly spread rows."""
@@ -99,13 +105,17 @@ class TextRows:
         return (digits[True], True) if digits[False] < 0 else (digits[False], False)
 
     def rewritten(self, changes: Sequence[NewFields]) -> Iterator[bytes]:
-        """The body with fields replaced and appended, in pieces; changes ordered by column, appended ones last."""
+        """The file's bytes with fields replaced and appended, in pieces; changes ordered by column, appended ones last."""
         at = 0
         for first, last in self._blocks() if changes else ():
             stop = int(self.ends[last - 1])
-            yield self._rewritten_block(changes, first, last, at, stop).tobytes()
+            yield self.as_in_file(self._rewritten_block(changes, first, last, at, stop))
             at = stop
-        yield self.body[at:].tobytes()
+        yield self.as_in_file(self.body[at:])
+
+    def as_in_file(self, octets: Octets) -> bytes:
+        """Bytes of a body like this one as they stand in the file."""
+        return (commas_for_points(octets) if self.decimal_comma else octets).tobytes()
 
     def _rewritten_block(self, changes: Sequence[NewFields], first: int, last: int, at: int, stop: int) -> Octets:
         """Bytes `at` to `stop` of the body, which end with row `last`, with the fields of rows `first` to `last` changed."""
@@ -189,8 +199,13 @@ class TextRows:
             return fields.astype(np.float64)
         except ValueError:
             row = next(i for i, field in enumerate(fields.tolist()) if not is_number(field) or len(field) > _LONGEST_NUMBER)
-            shown = fields[row][:20].decode("utf-8", "replace")
+            shown = self.as_in_file(np.frombuffer(fields[row][:20], np.uint8)).decode("utf-8", "replace")
             raise self.fault(first + row, f"'{shown}' is not a number; correct the line or remove it") from None
+
+
+def commas_for_points(octets: Octets) -> Octets:
+    """Bytes with commas where there are points and points where there are commas; twice, they are what they were."""
+    return _EXCHANGED[octets]
 
 
 @dataclass(frozen=True)
@@ -284,7 +299,7 @@ def coordinate_form(before: Points, digits: int, exponent: bool) -> str:
 
 def fewest_decimals(values: Column) -> int | None:
     """The fewest decimals, up to 12, that all values have; None if some have more, or all that float64 can hold there."""
-    finest = np.spacing(np.abs(values).max(initial=1e-3))
+    finest = np.spacing(np.abs(values[np.isfinite(values)]).max(initial=1e-3))
     for decimals in range(min(13, int(-np.log10(finest)))):
         if all(bool((np.round(some, decimals) == some).all()) for some in (values[:64], values)):
             return decimals

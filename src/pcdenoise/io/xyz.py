@@ -14,8 +14,8 @@ from pcdenoise.io.files import Raw, check_not_cut, let_go
 from pcdenoise.io.lines import Octets, find_lines, first_visible, is_number
 from pcdenoise.io.source import Column, changed, colours_as_bytes, exactly, moved_rows, portable, step_decimals
 from pcdenoise.io.source import is_number as holds_numbers
-from pcdenoise.io.text import NewFields, TextRows, coordinate_form, coordinates, plain
-from pcdenoise.io.xyz_header import AXES, Layout, axis_of, unique
+from pcdenoise.io.text import NewFields, TextRows, commas_for_points, coordinate_form, coordinates, plain
+from pcdenoise.io.xyz_header import AXES, Layout, axis_of, decoded, unique
 
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 _FEWEST_COUNTED, _MOST_COUNTED = 20, 4096
@@ -31,7 +31,6 @@ class XyzSource:
     indices    attribute name -> column.
     names_end  offset in `head` past the line that names the columns, if one does.
     count      span in `head` of a .pts file's point count, if there is one.
-    decimal_comma  whether the file has commas where `rows` has decimal points; then it has no points there.
     """
 
     head: bytes
@@ -42,7 +41,6 @@ class XyzSource:
     indices: Mapping[str, int]
     names_end: int | None
     count: tuple[int, int] | None
-    decimal_comma: bool = False
 
     def points(self) -> Points:
         """(N, 3) coordinates as read."""
@@ -60,12 +58,12 @@ class XyzSource:
         """The file without these columns, in its rows and in the line that names the columns."""
         head = self.head
         if self.names_end is not None:
-            joint = b" " if self.rows.delimiter is None else bytes([self.rows.delimiter])
+            joint = " " if self.rows.delimiter is None else chr(self.rows.delimiter)
             start = head.rfind(b"\n", 0, self.names_end) + 1
-            line = head[start : self.names_end]
+            line, coding = decoded(head[start : self.names_end])
             for name in names:
-                line = line.replace(joint + name.encode(), b"", 1)
-            head = head[:start] + line + head[self.names_end :]
+                line = line.replace(joint + name, "", 1)
+            head = head[:start] + line.encode(coding) + head[self.names_end :]
         return self._with(head, self.rows.without([self.indices[name] for name in names]))
 
     def selected(self, keep: Mask) -> XyzSource:
@@ -77,12 +75,9 @@ class XyzSource:
             head = head[: self.count[0]] + str(int(keep.sum())).encode() + head[self.count[1] :]
         return self._with(head, self.rows.selected(keep).body)
 
-    def as_written(self, body: bytes) -> bytes:
-        """Bytes of rows as the file has them."""
-        return body.replace(b".", b",") if self.decimal_comma else body
-
     def _with(self, head: bytes, body: Octets) -> XyzSource:
-        source: XyzSource = read(head + self.as_written(body.tobytes()), self.rows.origin).source
+        raw = head + self.rows.as_in_file(body)
+        source: XyzSource = read(raw, self.rows.origin, decimal_comma=self.rows.decimal_comma).source
         return source
 
 
@@ -91,18 +86,19 @@ def matches(head: bytes) -> bool:
     return head[:2] in _UTF16 or b"\0" not in head
 
 
-def read(raw: bytes, origin: str) -> Scan:
+def read(raw: bytes, origin: str, *, decimal_comma: bool = False) -> Scan:
     """A scan of text bytes. Columns are found by the names x, y, z, or easting, northing, height and the like, in a header line
     or comment, else they are the first three.
 
     Other columns become attributes under their header name, else column_4, column_5, … counted from 1.
+    decimal_comma: for a file that is known to have such numbers, whatever its first rows are.
     Raises ScanError naming the first line that lacks a coordinate, and where the first column counts rows.
     """
     if b"\0" in raw[:65536]:
         raise ScanError(f"{origin}: is binary or UTF-16, not text; name its real format or save it as UTF-8")
     octets = np.frombuffer(raw, np.uint8)
     starts, ends = find_lines(octets)
-    layout = Layout.of(raw, first_visible(octets, starts, ends), ends, origin)
+    layout = Layout.of(raw, first_visible(octets, starts, ends), ends, origin, decimal_comma=decimal_comma)
     body_start = int(starts[layout.first_row])
     rows = _rows(octets[body_start:], layout, origin, layout.first_row + 1)
     if layout.n_claimed > len(rows):
@@ -110,24 +106,20 @@ def read(raw: bytes, origin: str) -> Scan:
     axes, names = _named(rows, layout, origin)
     points, columns = _columns(rows, axes, names)
     indices = {name: names.index(name) for name in columns}
-    head = raw[:body_start]
-    source = XyzSource(head, rows, axes, points, columns, indices, layout.names_end, layout.count, layout.decimal_comma)
+    source = XyzSource(raw[:body_start], rows, axes, points, columns, indices, layout.names_end, layout.count)
     return Scan(points, columns, "xyz", origin, source)
 
 
 def _rows(octets: Octets, layout: Layout, origin: str, first_line: int) -> TextRows:
-    """The rows among lines that are whole: neither blank nor comments. Raises ScanError if some numbers have decimal commas and
-    others points."""
+    """The rows among lines that are whole: neither blank nor comments."""
     if layout.decimal_comma:
-        if (octets == ord(".")).any():
-            raise ScanError(f"{origin}: has decimal commas and decimal points; write all of its numbers with points")
-        octets = np.where(octets == ord(","), np.uint8(ord(".")), octets)
+        octets = commas_for_points(octets)
     starts, ends = find_lines(octets)
     visible = first_visible(octets, starts, ends)
     first = octets.take(visible, mode="clip") if len(octets) else octets
     second = octets.take(visible + 1, mode="clip") if len(octets) else octets
     is_row = (visible < ends) & (first != ord("#")) & ~((first == ord("/")) & (second == ord("/")))
-    return TextRows(octets, starts[is_row], ends[is_row], layout.delimiter, origin, first_line)
+    return TextRows(octets, starts[is_row], ends[is_row], layout.delimiter, origin, first_line, layout.decimal_comma)
 
 
 def _named(rows: TextRows, layout: Layout, origin: str) -> tuple[tuple[int, int, int], list[str]]:
@@ -197,7 +189,7 @@ class XyzStream:
                 self._learn(rows, points)
             head = self.raw[: self.body_start] if at == self.body_start else b""
             names_end = self.layout.names_end if at == self.body_start else None
-            source = XyzSource(head, rows, self.axes, points, {}, {}, names_end, None, self.layout.decimal_comma)
+            source = XyzSource(head, rows, self.axes, points, {}, {}, names_end, None)
             yield Scan(points, {}, "xyz", self.origin, source)
             let_go(self.raw)
             line += int((rows.body == 10).sum())
@@ -273,7 +265,7 @@ def _own(scan: Scan, source: XyzSource, forms: Sequence[str] | None) -> tuple[by
         joint = " " if rows.delimiter is None else chr(rows.delimiter)
         names = "".join(joint + name.replace(joint, "_") for name in columns)
         head = head[: source.names_end] + names.encode() + head[source.names_end :]
-    return head, map(source.as_written, rows.rewritten([*fields, *(plain(values) for values in columns.values())]))
+    return head, rows.rewritten([*fields, *(plain(values) for values in columns.values())])
 
 
 def _columns(rows: TextRows, axes: tuple[int, int, int], names: Sequence[str]) -> tuple[Points, dict[str, Column]]:
