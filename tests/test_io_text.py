@@ -171,6 +171,28 @@ def test_columns_with_names_in_latin_1_are_taken_out_with_their_names() -> None:
     assert source_bytes(source) == b"x y z Code\n1.5 2.5 3.5 7\n"
 
 
+def test_new_names_stand_under_those_of_columns_that_had_none() -> None:
+    raw = b"x y z\n1.5 2.5 3.5 7\n4.5 5.5 6.5 8\n"
+    out = written(xyz.read(raw, "sample").with_attributes(std=np.array([0.5, 0.25])))
+    assert out.splitlines()[:2] == [b"x y z column_4 std", b"1.5 2.5 3.5 7 0.5"]
+    back = xyz.read(out, "back")
+    assert back.attributes["column_4"].tolist() == [7, 8]
+    assert back.attributes["std"].tolist() == [0.5, 0.25]
+    assert source_bytes(back.source.without(["std"])) == raw.replace(b"z", b"z column_4")
+
+
+@pytest.mark.parametrize(
+    ("raw", "message"),
+    [
+        (b"X,Y,Z\n3,467,-6,181,-0,660\n", "line 2: has 6 fields under 3 names"),
+        (b"Nr;A;B;C\n3;1,5;2,5;3,5\n9;4,5;5,5;6,5\n", "its first column is Nr"),
+    ],
+)
+def test_columns_that_cannot_be_told_apart_are_refused(raw: bytes, message: str) -> None:
+    with pytest.raises(ScanError, match=message):
+        xyz.read(raw, "sample")
+
+
 def test_points_that_became_no_numbers_are_written_as_such() -> None:
     scan = xyz.read(b"1.5 2.5 3.5\n4.5 5.5 6.5\n", "sample")
     assert written(scan.moved_to(np.array([[1.5, 2.5, 3.5], [np.nan, np.inf, 6.5]]))).splitlines()[1] == b"nan inf 6.5"

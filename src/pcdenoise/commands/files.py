@@ -161,6 +161,8 @@ def refuse_unwritable(targets: Sequence[Path | None], overwrite: bool) -> None:
     """
     files = [target for target in targets if target is not None and target != STREAM]
     for target in filter(Path.exists, files):
+        if target.is_dir():
+            raise ScanError(f"{target}: is a folder; name a file in it")
         if not overwrite:
             raise ScanError(f"{target}: the file exists; add --overwrite to replace it")
         if target.is_file() and not target.stat().st_mode & _WRITABLE:

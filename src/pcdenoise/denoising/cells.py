@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pcdenoise.cloud.blocks import blocks
 from pcdenoise.cloud.neighbours import Distances, Identity, Indices, NeighbourSearch, nearest_to, spatial_order
 from pcdenoise.cloud.scan import Mask, Points
 
@@ -23,13 +24,14 @@ at one radius, so that what lies beyond five does not reach a thousandth of the 
 noisier than the cloud, neighbourhoods are wider, by up to a half."""
 _RINGS = 9
 """So many times the nearest of the nearest, in place of a rim: what a pass reaches, and one more for noisier places."""
-_SAMPLED = 256
-_FEWEST_IN_TILE, _MEDIUM_TILE = 512, 20_000
-_ASKING = 8  # of the points of a neighbourhood say where it ends: theirs lie over each other
+_FEWEST_IN_TILE = 512
+_MEDIUM_TILE = 20_000  # points: a smaller tile takes little memory, whatever cells were asked for
+_ASKING = 8  # of the points of a neighbourhood
+_ASKED_FOR = 1 << 22  # neighbours at once
 
 
-def share_of_own(n_points: int) -> int:
-    """How many points of a tile of that size are a cell's own, where density is even."""
+def n_own(n_points: int) -> int:
+    """How many points of a tile of so many are a cell's own, where density is even."""
     return int(_CORE_SHARE * n_points)
 
 
@@ -60,7 +62,7 @@ class Cells:
     """
 
     folder: Path
-    n: int
+    n_cells: int
     n_points: int
     asked_for: int
     low: Points
@@ -68,10 +70,10 @@ class Cells:
     threads: int
 
     def __len__(self) -> int:
-        return self.n
+        return self.n_cells
 
     def __iter__(self) -> Iterator[int]:
-        return iter(range(self.n))
+        return iter(range(self.n_cells))
 
     def part(self, cell: int, number: int) -> Part:
         """The points of a cell, in the order of their hashes, after so many passes."""
@@ -97,7 +99,7 @@ class Cells:
             if gap > furthest:
                 break
             part = self.part(cell, number)
-            part = part.take(_inside(part.points, low - furthest, high + furthest))
+            part = part.take(_inside(part.points, np.nextafter(low - furthest, -np.inf), np.nextafter(high + furthest, np.inf)))
             if len(part.points):
                 near += part
                 near = near.take(self.order(near.points))
@@ -123,51 +125,60 @@ class Cells:
     def tile(self, cell: int, number: int, k: int, ball: float = 0.0) -> tuple[Part, Part]:
         """A cell's own points after a pass, and these followed by what a pass over neighbourhoods of k points hears of.
 
-        ball: the radius of what a pass looks at, where that is a length.
+        That is a rim of even width or, where something dense lies beside a sparse cell and would be in it as a whole, rings.
+        ball: the radius of what a pass looks at, where that is a length; then the tile has all within it, however many.
         """
         own = self.part(cell, number)
         if not len(own.points):
             return own, own
         low, high = own.points.min(axis=0), own.points.max(axis=0)
         ordered = own.points[self.order(own.points)]
-        some = ordered[:: max(1, len(ordered) // _SAMPLED)]
-        radius = float(np.quantile(NeighbourSearch(ordered, self.threads).knn(some, k)[0][:, -1], 0.9))
-        margin = max(_RIM_RADII * radius, ball, 1e-12)
+        radii = NeighbourSearch(ordered, self.threads).knn(ordered, k)[0][:, -1]
+        margin = max(_RIM_RADII * float(np.quantile(radii, 0.9)), ball, 1e-12)
+        most = math.inf if ball else max(self.asked_for / _CORE_SHARE, _MEDIUM_TILE)
         while True:
-            tile = own
-            for other in self:
-                if other != cell and self._meets(other, number, low - margin, high + margin):
-                    part = self.part(other, number)
-                    tile += part.take(_inside(part.points, low - margin, high + margin))
-                    if not ball and len(tile.points) > max(self.asked_for / _CORE_SHARE, _MEDIUM_TILE):
-                        return own, self._heard_of(own, number, k)
-            if len(tile.points) >= min(_FEWEST_IN_TILE, self.n_points):
-                return own, tile
-            margin *= 2
-
-    def _heard_of(self, own: Part, number: int, k: int) -> Part:
-        """A cell's points followed by their nearest, the nearest of these and so on.
-
-        Where something dense lies beside a sparse cell, a rim as wide as the sparse one's neighbourhoods would hold all of it.
-        """
-        tile, new = own, own.take(self.order(own.points))
-        for _ in range(_RINGS):
-            found = self.nearest(new.points[:: max(1, k // _ASKING)], k, number)[0]
-            new = found.take(~np.isin(found.identity, tile.identity))
-            if not len(new.points):
+            tile, n = own, len(own.points)
+            for part in self._rim(cell, number, low - margin, high + margin):
+                n += len(part.points)
+                tile = tile + part if n <= most else own
+            if n >= min(_FEWEST_IN_TILE, self.n_points):
                 break
-            tile += new
+            margin *= 2
+        if n <= most:
+            return own, self._with_rings(tile, ordered[radii > margin / 2], number, k)
+        tile = self._with_rings(own, ordered, number, k)
+        if len(tile.points) > n:  # in a volume, rings are the wider
+            tile = sum(self._rim(cell, number, low - margin, high + margin), start=own)
+        return own, tile
+
+    def _with_rings(self, tile: Part, asking: Points, number: int, k: int) -> Part:
+        """A tile followed by the nearest of some of its points, the nearest of these and so on, as far as they are not in it.
+
+        After the first ring some points ask for all, since neighbourhoods lie over each other.
+        """
+        for _ in range(_RINGS):
+            n = len(tile.points)
+            for rows in blocks(len(asking), max(1, _ASKED_FOR // k)):
+                found = self.nearest(asking[rows], k, number)[0]
+                tile += found.take(~np.isin(found.identity, tile.identity))
+            asking = tile.points[n:]
+            asking = asking[self.order(asking)][:: max(1, k // _ASKING)]
         return tile
+
+    def _rim(self, cell: int, number: int, low: Points, high: Points) -> Iterator[Part]:
+        """The points of all other cells in a box after a pass."""
+        for other in self:
+            if other != cell:
+                its_low, its_high = self._box(other, number)
+                if (its_low <= high).all() and (its_high >= low).all():
+                    part = self.part(other, number)
+                    yield part.take(_inside(part.points, low, high))
 
     def _by_distance(self, low: Points, high: Points, number: int) -> list[tuple[float, int]]:
         """How far from a box the points of each cell are at least, and its number, nearest first; none without points."""
         boxes = [(self._box(cell, number), cell) for cell in self]
         gaps = [(np.maximum(0, np.maximum(its_low - high, low - its_high)), cell) for (its_low, its_high), cell in boxes]
         return sorted((float(np.linalg.norm(gap)), cell) for gap, cell in gaps if np.isfinite(gap).all())
-
-    def _meets(self, cell: int, number: int, low: Points, high: Points) -> bool:
-        its_low, its_high = self._box(cell, number)
-        return bool((its_low <= high).all() and (its_high >= low).all())
 
     def _box(self, cell: int, number: int) -> tuple[Points, Points]:
         if (cell, number) not in self._boxes:

@@ -5,7 +5,7 @@ surroundings (cells.py), scan files (io), one pass (denoiser.py).
 
 All that is global in a pass is found first, streaming, exactly as it is found in memory: the frame's origin, the probes and the
 noise level they read, the stop rule. The rest is local, and every draw is a hash of a point's place in the file, so a cell needs
-nothing but a rim as wide as the network sees.
+nothing but what the network sees around it.
 
 FOLDER/plan.json        what is cleaned and how, and the cuts between the cells
 FOLDER/start/7.f64      distinct points of cell 7: x, y, z in the local frame and the hash of the place in the file, ascending
@@ -44,7 +44,7 @@ from pcdenoise.cloud.noise_level import N_PROBES, NoiseLevel, by_place, estimate
 from pcdenoise.cloud.scan import Mask, Points, check_extent
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import classical, denoiser, outliers, risk, taken_off, uncertainty
-from pcdenoise.denoising.cells import Cells, Part, share_of_own
+from pcdenoise.denoising.cells import Cells, Part, n_own
 from pcdenoise.denoising.cuts import by_cell, cell_of, cuts_of, number_of_cells
 from pcdenoise.denoising.denoiser import Progress
 from pcdenoise.denoising.seeds import share_of_seeds
@@ -76,7 +76,7 @@ def needed_bytes(n_points: int) -> int:
 
 def points_per_cell(max_bytes: int) -> int:
     """How many points a cell may have, so that it is cleaned within so much memory."""
-    return max(10_000, share_of_own((max_bytes - BASE_BYTES) // POINT_BYTES))
+    return max(10_000, n_own((max_bytes - BASE_BYTES) // POINT_BYTES))
 
 
 @dataclass(frozen=True)
@@ -379,7 +379,7 @@ class Tiles:
         _write(path, std.tobytes())
 
     def _tile(self, cell: int, number: int) -> tuple[Part, Part]:
-        """A cell's own points after a pass, and these followed by its rim."""
+        """A cell's own points after a pass, and these followed by what lies around, as of `Cells.tile`."""
         level = self.level(number)
         return self.cells.tile(cell, number, 1 + self._neighbours(level), self._ball(level))
 

@@ -299,9 +299,12 @@ def coordinate_form(before: Points, digits: int, exponent: bool) -> str:
 
 def fewest_decimals(values: Column) -> int | None:
     """The fewest decimals, up to 12, that all values have; None if some have more, or all that float64 can hold there."""
-    finest = np.spacing(np.abs(values[np.isfinite(values)]).max(initial=1e-3))
+    values = values[np.isfinite(values)]
+    finest = np.spacing(np.abs(values).max(initial=1e-3))
     for decimals in range(min(13, int(-np.log10(finest)))):
-        if all(bool((np.round(some, decimals) == some).all()) for some in (values[:64], values)):
+        if all(
+            bool((np.abs(np.round(some, decimals) - some) <= np.spacing(np.abs(some))).all()) for some in (values[:64], values)
+        ):
             return decimals
     return None
 

@@ -18,6 +18,8 @@ from pcdenoise.io.text import NewFields, TextRows, commas_for_points, coordinate
 from pcdenoise.io.xyz_header import AXES, Layout, axis_of, decoded, unique
 
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
+_COUNTS = frozenset(["id", "fid", "oid", "nr", "no", "n°", "num", "number", "nummer", "pkt", "pkt-nr", "punkt", "point", "punto"])
+"""What first columns are called that number the points."""
 _FEWEST_COUNTED, _MOST_COUNTED = 20, 4096
 _NEW_FILE_STEP = 1e-9
 _MOST_COLUMNS = 4096
@@ -30,6 +32,7 @@ class XyzSource:
 
     indices    attribute name -> column.
     names_end  offset in `head` past the line that names the columns, if one does.
+    unnamed    names of the columns that this line leaves out.
     count      span in `head` of a .pts file's point count, if there is one.
     """
 
@@ -41,6 +44,7 @@ class XyzSource:
     indices: Mapping[str, int]
     names_end: int | None
     count: tuple[int, int] | None
+    unnamed: Sequence[str] = ()
 
     def points(self) -> Points:
         """(N, 3) coordinates as read."""
@@ -106,7 +110,8 @@ def read(raw: bytes, origin: str, *, decimal_comma: bool = False) -> Scan:
     axes, names = _named(rows, layout, origin)
     points, columns = _columns(rows, axes, names)
     indices = {name: names.index(name) for name in columns}
-    source = XyzSource(raw[:body_start], rows, axes, points, columns, indices, layout.names_end, layout.count)
+    head, unnamed = raw[:body_start], names[len(layout.names) :]
+    source = XyzSource(head, rows, axes, points, columns, indices, layout.names_end, layout.count, unnamed)
     return Scan(points, columns, "xyz", origin, source)
 
 
@@ -132,6 +137,10 @@ def _named(rows: TextRows, layout: Layout, origin: str) -> tuple[tuple[int, int,
         found = [axis_of(name, words) for name in names]
         if set(words.values()) <= set(found):
             return (found.index("x"), found.index("y"), found.index("z")), names
+    if n_fields > 3 and layout.names and names[0].strip().lower() in _COUNTS:
+        raise ScanError(
+            f"{origin}: its first column is {names[0]}, and no names say which columns are x, y and z; name them in a first line"
+        )
     if n_fields > 3 and _counts(replace(rows, starts=rows.starts[:_MOST_COUNTED], ends=rows.ends[:_MOST_COUNTED])):
         raise ScanError(
             f"{origin}: its first column counts the rows, so that nothing says which columns are x, y and z;"
@@ -159,9 +168,10 @@ class XyzStream:
         starts, ends = find_lines(octets)
         self.layout = Layout.of(start, first_visible(octets, starts, ends), ends, origin)
         self.body_start = int(starts[self.layout.first_row])
-        self.axes, _ = _named(
+        self.axes, names = _named(
             _rows(octets[self.body_start :], self.layout, origin, self.layout.first_row + 1), self.layout, origin
         )
+        self._unnamed = names[len(self.layout.names) :]
         self.raw, self.origin, self.format = raw, origin, "xyz"
         self._row_bytes = max(8, (len(start) - self.body_start) // max(1, len(starts) - self.layout.first_row))
         self.n_points = (len(raw) - self.body_start) // self._row_bytes + 1
@@ -189,7 +199,7 @@ class XyzStream:
                 self._learn(rows, points)
             head = self.raw[: self.body_start] if at == self.body_start else b""
             names_end = self.layout.names_end if at == self.body_start else None
-            source = XyzSource(head, rows, self.axes, points, {}, {}, names_end, None)
+            source = XyzSource(head, rows, self.axes, points, {}, {}, names_end, None, self._unnamed)
             yield Scan(points, {}, "xyz", self.origin, source)
             let_go(self.raw)
             line += int((rows.body == 10).sum())
@@ -263,7 +273,7 @@ def _own(scan: Scan, source: XyzSource, forms: Sequence[str] | None) -> tuple[by
     fields.sort(key=lambda change: change.column if isinstance(change.column, int) else 0)
     if source.names_end is not None:
         joint = " " if rows.delimiter is None else chr(rows.delimiter)
-        names = "".join(joint + name.replace(joint, "_") for name in columns)
+        names = "".join(joint + name.replace(joint, "_") for name in [*(source.unnamed if columns else ()), *columns])
         head = head[: source.names_end] + names.encode() + head[source.names_end :]
     return head, rows.rewritten([*fields, *(plain(values) for values in columns.values())])
 

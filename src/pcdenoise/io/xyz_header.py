@@ -12,15 +12,17 @@ from pcdenoise.io.lines import Offsets, is_number, split_fields
 _DELIMITERS = (ord(";"), ord(","), ord("\t"), None)
 _COMMENTS = (b"#", b"//")
 _BOM = b"\xef\xbb\xbf"
-_EAST = "e east easting x_coord xcoord coord_x rechts rechtswert ost ostwert est este oost"
-_NORTH = "n north northing y_coord ycoord coord_y hoch hochwert nord nordwert norte noord"
-_HEIGHT = "h height elev elevation alt altitude z z_coord zcoord coord_z höhe hoehe cota quota altura hoogte"
+_EAST = "e east easting x_coord xcoord coord_x rechts rechtswert rw abscisse ost ostwert est este oost"
+_NORTH = "n north northing y_coord ycoord coord_y hoch hochwert hw ordonnée nord nordwert norte noord"
+_HEIGHT = (
+    "h height alt altitude altitud elev elevation elevación z z_coord zcoord coord_z höhe hoehe nhn cota quota altura hoogte"
+)
 AXES: tuple[Mapping[str, str], ...] = (
     {"x": "x", "y": "y", "z": "z"},
     {
-        **dict.fromkeys([*_EAST.split(), "x coordinate"], "x"),
-        **dict.fromkeys([*_NORTH.split(), "y coordinate"], "y"),
-        **dict.fromkeys([*_HEIGHT.split(), "z coordinate"], "z"),
+        **dict.fromkeys([*_EAST.split(), "x coordinate", "coordenada x"], "x"),
+        **dict.fromkeys([*_NORTH.split(), "y coordinate", "coordenada y"], "y"),
+        **dict.fromkeys([*_HEIGHT.split(), "z coordinate", "coordenada z"], "z"),
     },
 )
 """What columns are called that hold coordinates; the first set that is complete counts."""
@@ -69,6 +71,11 @@ class Layout:
                 following = (raw[first:last] for first, last in spans[i:])
                 decimal_comma = decimal_comma or (delimiter != ord(",") and _turns_to_commas(following, delimiter))
                 names, names_end = _names(titles, delimiter, len(fields))
+                if delimiter == ord(",") and len(fields) == 2 * len(names) and all(map(_is_whole, fields)):
+                    raise ScanError(
+                        f"{origin}: line {i + 1}: has {len(fields)} fields under {len(names)} names, so that commas"
+                        " divide columns and mark decimals; save it with another delimiter"
+                    )
                 claimed = int(raw[slice(*count)]) if count else 0
                 return cls(i, delimiter, decimal_comma, names, names_end, count, claimed)
             if count is None and len(fields) == 1 and line.strip().isdigit() and len(line) < 19:
@@ -89,6 +96,10 @@ def _best(line: bytes, counts: Callable[[bytes], bool]) -> tuple[int, list[bytes
 def _has_no_point(field: bytes) -> bool:
     """Whether a field is a number with a decimal comma or a whole one."""
     return _DECIMAL_COMMA.fullmatch(field) is not None or (b"." not in field and is_number(field))
+
+
+def _is_whole(field: bytes) -> bool:
+    return is_number(field) and field.lstrip(b"+-").isdigit()
 
 
 def _turns_to_commas(lines: Iterable[bytes], delimiter: int | None) -> bool:

@@ -31,9 +31,10 @@ class CloudsAhead(ABC, Generic[CloudT]):
         """The number-th cloud; it depends on nothing but the source and these."""
 
     def clouds(self, first: int, neighbours: int, stride: int = 1, n_makers: int = 1) -> Generator[CloudT, None, None]:
-        """Endless clouds from the first-th on, every stride-th, made by so many processes; by this one when asked for if none."""
+        """Endless clouds from the first-th on, every stride-th, made by so many processes, or by this one when asked for."""
         if n_makers == 0:
-            yield from (self.cloud(number, neighbours) for number in count(first, stride))
+            for number in count(first, stride):
+                yield self.cloud(number, neighbours)
         ahead = _AHEAD * n_makers
         with ProcessPoolExecutor(n_makers, get_context("spawn"), _leave_interrupts_to_the_parent) as makers:
             waiting = deque(makers.submit(self.cloud, first + i * stride, neighbours) for i in range(ahead))

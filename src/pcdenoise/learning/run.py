@@ -157,7 +157,7 @@ class Run:
         assert isinstance(self.average, ProjectionNetwork)
         errors = np.full((2, len(clouds)), math.nan)
         for i, cloud in enumerate(clouds):
-            errors[:, i] = held_out_error(before, cloud), held_out_error(self.average, cloud)
+            errors[:, i] = [held_out_error(weights, cloud, self.config.threads or -1) for weights in (before, self.average)]
             on_progress("judging", (i + 1) / len(clouds))
         old, new = errors
         known = np.isfinite(old) & np.isfinite(new)

@@ -45,11 +45,11 @@ def split_loss(network: ProjectionNetwork, cloud: TrainingCloud) -> tuple[Tensor
     return loss + robust(error), error.square().mean()
 
 
-def held_out_error(network: ProjectionNetwork, cloud: TrainingCloud) -> float:
+def held_out_error(network: ProjectionNetwork, cloud: TrainingCloud, threads: int) -> float:
     """The error of `split_loss` on a cloud, for comparing weights without truth; NaN where too little is held out."""
     with torch.no_grad():
         last = descend(network, *cloud.given).last
-    height = HeldOut(cloud.held_out, cloud.noise, threads=-1).known_heights(last.float(), cloud.on_surface)
+    height = HeldOut(cloud.held_out, cloud.noise, threads).known_heights(last.float(), cloud.on_surface)
     return float((height / cloud.scale).square().mean())
 
 
@@ -58,6 +58,7 @@ class HeldOut:
 
     def __init__(self, points: Array, noise: float, threads: int = 1) -> None:
         self._points, self._noise, self._threads = points[spatial_order(points)], noise, threads
+        self._search = NeighbourSearch(self._points, threads) if len(points) >= _POINTS else None
 
     def known_heights(self, points: Tensor, judged: Mask) -> Tensor:
         """(K,) heights, with gradient, of those of the judged (M, 3) points around which the fit holds."""
@@ -74,8 +75,8 @@ class HeldOut:
     def _feet(self, place: Array) -> tuple[Array, Array, Mask]:
         """(M, 3) points of the fitted surface over or under each place, (M, 3) normals, (M,) where the fit holds."""
         foot, normal, known = place.copy(), np.zeros_like(place), np.zeros(len(place), dtype=bool)
-        if len(place) and len(self._points) >= _POINTS:
-            distances, index = NeighbourSearch(self._points, self._threads).knn(place, 4 * _POINTS)
+        if self._search is not None and len(place):
+            distances, index = self._search.knn(place, 4 * _POINTS)
 
             def fit(rows: slice) -> None:
                 foot[rows], normal[rows], known[rows] = self._fitted(place[rows], self._points[index[rows]], distances[rows])
