@@ -145,10 +145,11 @@ def target_name(source: Path, suffix: str = "", format: str | None = None, found
     return f"{stem}{suffix}{'.' + format if format else extension}"
 
 
-def refuse_file(folder: Path) -> None:
-    """Raises ScanError before any work is done if a file stands where results need a folder."""
+def refuse_folder(folder: Path) -> None:
+    """Raises ScanError before any work is done if results need a folder where a file stands, or that takes no file."""
     if folder.exists() and not folder.is_dir():
         raise not_a_folder(str(folder))
+    _try_folder(folder.absolute(), folder)
 
 
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
@@ -167,24 +168,25 @@ def refuse_unwritable(targets: Sequence[Path | None], overwrite: bool) -> None:
             raise ScanError(f"{target}: the file exists; add --overwrite to replace it")
         if target.is_file() and not target.stat().st_mode & _WRITABLE:
             raise ScanError(f"{target}: is read-only, so that --overwrite leaves it; make it writable or write elsewhere")
-    _refuse_closed_folders(files)
-
-
-def _refuse_closed_folders(targets: Sequence[Path]) -> None:
-    """Tries one file in each folder, or in the one that a missing folder is to be made in."""
-    import tempfile  # a help page need not wait for it
-
-    of_folder: dict[Path, Path] = {}
-    for target in targets:
+    folders: dict[Path, Path] = {}
+    for target in files:
         place = Path(os.path.realpath(target))
         if place.is_file() or not place.exists():  # devices and pipes are written to as they are
-            of_folder.setdefault(next(folder for folder in place.parents if folder.exists()), target)
-    for folder, target in of_folder.items():
-        if folder.is_dir():
-            try:
-                tempfile.TemporaryFile(dir=folder).close()
-            except OSError as fault:
-                raise cannot_be_written(target, fault) from None
+            folders.setdefault(place.parent, target)
+    for folder, target in folders.items():
+        _try_folder(folder, target)
+
+
+def _try_folder(folder: Path, target: Path) -> None:
+    """Makes a file for a moment in a folder, or in the one it is to be made in. Raises ScanError for the target if that fails."""
+    import tempfile  # a help page need not wait for it
+
+    there = next(place for place in (folder, *folder.parents) if place.exists())
+    if there.is_dir():
+        try:
+            tempfile.TemporaryFile(dir=there).close()
+        except OSError as fault:
+            raise cannot_be_written(target, fault) from None
 
 
 def refuse_unknown(targets: Sequence[Path], format: str | None) -> None:

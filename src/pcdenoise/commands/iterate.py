@@ -11,7 +11,7 @@ from pcdenoise.commands.cleaning import chosen_model, named_model
 from pcdenoise.commands.console import Console, counted, figure, table
 from pcdenoise.commands.denoise import Draws, Iters, Method, Neighbours, Radius, SigmaD, SigmaN, Unshrink
 from pcdenoise.commands.eval_chamfer import points_to_compare
-from pcdenoise.commands.files import format_of, refuse_file, refuse_unwritable, target_name
+from pcdenoise.commands.files import format_of, refuse_folder, refuse_unwritable, target_name
 from pcdenoise.commands.options import argument, configured, option
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def iterate(
         unshrink=unshrink, neighbours=neighbours, radius=radius, sigma_d=sigma_d, sigma_n=sigma_n, seed=seed, threads=threads,
     )  # fmt: skip
     strip, report = output / "passes.png", output / "report.html"
-    refuse_file(output)
+    refuse_folder(output)
     refuse_unwritable([strip, report], overwrite)
     scan = io.read(source, format=format_of(source, format))
 

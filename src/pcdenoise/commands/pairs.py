@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pcdenoise.commands import options
 from pcdenoise.commands.batch import Batch, Figures
 from pcdenoise.commands.console import Console, counted
-from pcdenoise.commands.files import Job, expand, format_of, plan, refuse_file, refuse_unwritable, target_name
+from pcdenoise.commands.files import Job, expand, format_of, plan, refuse_folder, refuse_unwritable, target_name
 from pcdenoise.commands.options import option
 from pcdenoise.errors import UsageError
 
@@ -48,7 +48,7 @@ def pairs(
     from pcdenoise.learning.scans import colours_of
     from pcdenoise.learning.upgrade import prior_for, pseudo_clean
 
-    refuse_file(output)
+    refuse_folder(output)
     console = Console(quiet)
     jobs = plan(expand(inputs), f"{output}/", format=to)
 

@@ -8,7 +8,7 @@ from typing import Annotated
 from pcdenoise.commands import options
 from pcdenoise.commands.batch import Batch, Figures
 from pcdenoise.commands.console import Console, counted
-from pcdenoise.commands.files import Job, expand, format_of, plan, refuse_file, refuse_unwritable, target_name
+from pcdenoise.commands.files import Job, expand, format_of, plan, refuse_folder, refuse_unwritable, target_name
 from pcdenoise.commands.options import option
 
 
@@ -32,7 +32,7 @@ def split(
     from pcdenoise import io
     from pcdenoise.cloud.neighbours import parts
 
-    refuse_file(output)
+    refuse_folder(output)
     console = Console(quiet)
 
     def cut(job: Job) -> Figures:

@@ -144,12 +144,12 @@ class Cells:
             if n >= min(_FEWEST_IN_TILE, self.n_points):
                 break
             margin *= 2
-        if n <= most:
-            return own, self._with_rings(tile, ordered[radii > margin / 2], number, k)
-        tile = self._with_rings(own, ordered, number, k)
-        if len(tile.points) > n:  # in a volume, rings are the wider
-            tile = sum(self._rim(cell, number, low - margin, high + margin), start=own)
-        return own, tile
+        if n > most:
+            rings = self._with_rings(own, ordered, number, k)
+            if len(rings.points) <= n:
+                return own, rings
+            tile = sum(self._rim(cell, number, low - margin, high + margin), start=own)  # in a volume, rings are the wider
+        return own, self._with_rings(tile, ordered[radii > margin / 2], number, k)
 
     def _with_rings(self, tile: Part, asking: Points, number: int, k: int) -> Part:
         """A tile followed by the nearest of some of its points, the nearest of these and so on, as far as they are not in it.
