@@ -78,6 +78,16 @@ def not_a_folder(path: str) -> ScanError:
     return ScanError(f"{path}: is a file where a folder is needed; choose another name")
 
 
+def is_a_folder(path: object) -> ScanError:
+    """What the user is told where a folder stands in the place of a file that is to be written."""
+    return ScanError(f"{path}: is a folder; name a file in it")
+
+
+def exists_already(path: object) -> ScanError:
+    """What the user is told where a file stands that must not be replaced."""
+    return ScanError(f"{path}: exists already; choose another name or allow overwriting (--overwrite)")
+
+
 def cannot_be_written(place: object, fault: OSError, check: str = "the folder's permissions and free space") -> ScanError:
     """What the user is told where the system takes no file; check: what to look at."""
     return ScanError(f"{place}: cannot be written ({fault.strerror}); check {check}")

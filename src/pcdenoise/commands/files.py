@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pcdenoise.errors import ScanError, UsageError, cannot_be_written, not_a_folder
+from pcdenoise.errors import ScanError, UsageError, cannot_be_written, is_a_folder, not_a_folder
 
 if TYPE_CHECKING:
     from pcdenoise.cloud.scan import Scan
@@ -163,7 +163,7 @@ def refuse_unwritable(targets: Sequence[Path | None], overwrite: bool) -> None:
     files = [target for target in targets if target is not None and target != STREAM]
     for target in filter(Path.exists, files):
         if target.is_dir():
-            raise ScanError(f"{target}: is a folder; name a file in it")
+            raise is_a_folder(target)
         if not overwrite:
             raise ScanError(f"{target}: the file exists; add --overwrite to replace it")
         if target.is_file() and not target.stat().st_mode & _WRITABLE:

@@ -285,13 +285,11 @@ class Tiles:
         if path.is_file():
             return NoiseLevel(**json.loads(path.read_text()))
         probed, keys = np.array(plan["probes"]).reshape(-1, 3), np.array(plan["probe_keys"], np.uint64)
-        home: dict[bytes, int] = {}
         for cell, those in by_cell(cell_of(probed, plan["cuts"])):
             part = self.cells.part(cell, number)
             drawn = drawn_by(part.identity, self.config.seed)
             order = np.argsort(drawn)
             probed[those] = part.points[order[np.searchsorted(drawn, keys[those], sorter=order)]]
-            home |= {point.tobytes(): cell for point in probed[those]}
         self._gathered = {k: {} for k in _GATHERED}
 
         def around(centres: Points, k: int) -> tuple[Distances, Points]:
@@ -299,8 +297,7 @@ class Tiles:
             missing = np.array([centre.tobytes() not in kept for centre in centres])
             if missing.any():
                 most = min(next(n for n in _GATHERED if n >= k), plan["n_distinct"])
-                cells = np.array([home[centre.tobytes()] for centre in centres[missing]])
-                for _, those in by_cell(cells):
+                for _, those in by_cell(cell_of(centres[missing], plan["cuts"])):  # near each other, so that few cells are read
                     asked = centres[missing][those]
                     near, distances, rows = self.cells.nearest(asked, most, number)
                     kept.update(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from pcdenoise.errors import ScanError, cannot_be_written
+from pcdenoise.errors import cannot_be_written, exists_already
 from pcdenoise.whole_files import replaced
 
 
@@ -13,7 +13,7 @@ def write_whole(path: str | os.PathLike[str], data: bytes, *, overwrite: bool) -
     """Write the bytes to `path`. Raises ScanError if that fails or would overwrite unasked."""
     target = Path(path)
     if target.exists() and not overwrite:
-        raise ScanError(f"{path}: exists already; choose another name or allow overwriting (--overwrite)")
+        raise exists_already(path)
     try:
         with replaced(target) as file:
             file.write(data)

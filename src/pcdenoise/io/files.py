@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from pcdenoise.errors import ScanError, cannot_be_written
+from pcdenoise.errors import ScanError, cannot_be_written, exists_already, is_a_folder
 from pcdenoise.whole_files import replaced
 
 Raw = bytes | mmap.mmap
@@ -117,11 +117,11 @@ def written(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[Binary
 
 def _check_target(path: str | os.PathLike[str], target: Path, overwrite: bool) -> None:
     if target.is_dir():
-        raise ScanError(f"{path}: is a folder; name a file in it")
+        raise is_a_folder(path)
     if not target.parent.is_dir():
         raise ScanError(f"{path}: folder {target.parent} does not exist; create it first")
     if target.exists() and not overwrite:
-        raise ScanError(f"{path}: exists already; choose another name or allow overwriting (--overwrite)")
+        raise exists_already(path)
 
 
 @contextmanager
