@@ -98,23 +98,6 @@ def test_traps_are_named_and_an_ordinary_scan_has_none(tmp_path: Path) -> None:
         assert words in warnings_of(pcdenoise.read(path))
 
 
-def test_depths_of_a_camera_are_taken_for_rounded_and_rows_and_storeys_are_not() -> None:
-    """Depth by disparity, of a wavy wall, 45 to 85 of its steps; a grid of heights, rows far apart, ten storeys."""
-    u, v = (axis.ravel() for axis in np.meshgrid(np.arange(600.0), np.arange(400.0)))
-    disparity = np.rint(65 + 20 * np.sin(u / 150) * np.cos(v / 120))
-    depth = 65 / disparity
-    said = warnings_of(Scan(np.column_stack([u * depth / 600, v * depth / 600, depth])))
-    assert "z was rounded" in said
-    std = np.median(65 / disparity**2) / np.sqrt(12)
-    assert float(said.split("--noise ")[1].split()[0]) == pytest.approx(std, rel=0.1)
-    u, v = (axis.ravel() for axis in np.meshgrid(np.arange(300.0), np.arange(200.0)))
-    waves = np.sin(u / 60) * np.cos(v / 50)
-    grid, rows_of_a_line_scanner = np.column_stack([u, v, waves]), np.column_stack([u, 12 * v, waves])
-    ten_storeys = np.column_stack([u, v % 20, 5 * (v // 20)])
-    for points in (grid, rows_of_a_line_scanner, ten_storeys, ten_storeys + 1e-3 * waves[:, None], grid[:5], grid[:0]):
-        assert "was rounded" not in warnings_of(Scan(points))
-
-
 def test_a_step_that_swallows_moves_is_that_of_a_las_and_of_nothing_else(tmp_path: Path) -> None:
     """A plane whose noise is half of the coarsest step of the file; a text of the same numbers gets the decimals it needs."""
     sample = cloud("plane", 4000, 0.5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,13 +41,15 @@ def denoise(
     if chosen.method != "network":
         model = None
     loaded = model if isinstance(model, Model) or model is None else store.load(model)
-    if not isinstance(points, Scan):
-        if chosen.align_by:
-            raise UsageError("align_by: names columns, which an array has not; give a Scan")
-        return denoiser.denoise(rows, loaded, chosen, on_progress)
-    groups = groups_asked_for(points, loaded, chosen)
-    shift = None if groups is None else denoiser.shift_of(rows, groups, loaded, chosen)[0]
-    return denoiser.denoise(rows, loaded, chosen, on_progress, shift=shift)
+    if not isinstance(points, Scan) and chosen.align_by:
+        raise UsageError("align_by: names columns, which an array has not; give a Scan")
+    groups = groups_asked_for(points, loaded, chosen) if isinstance(points, Scan) else None
+    shift, figures = denoiser.unrounding(rows, chosen)
+    if groups is not None:
+        offsets, about = denoiser.shift_of(rows + shift, groups, loaded, chosen)
+        shift, figures = shift + offsets, figures | about
+    result = denoiser.denoise(rows, loaded, chosen, on_progress, shift=shift)
+    return replace(result, figures={**result.figures, **figures})
 
 
 def _configured(settings: dict[str, Any]) -> DenoiseConfig:

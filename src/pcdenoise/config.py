@@ -36,6 +36,7 @@ class DenoiseConfig(Settings):
         None,
         description="Columns: rows that agree in them are off together and first shifted together; by default the model's.",
     )
+    unround: bool = Field(True, description="Bring depths that a camera rounded to steps back between the steps.")
     strength: float = Field(1.0, ge=0, le=1, description="Share of the move that is carried out.")
     max_move: float | None = Field(None, gt=0, description="Longest move of any point, in the scan's unit.")
     relax_steps: int = Field(4, ge=0, le=100, description="Steps toward even spacing, within the noise; 0 for none.")

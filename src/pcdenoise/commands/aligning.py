@@ -1,6 +1,6 @@
-"""`--align-by`: how groups of a scan's points are shifted onto each other before it is cleaned, and what is said of that.
+"""What is shifted before a scan is cleaned, and what is said of that: rounded depths, and by `--align-by` groups of its points.
 
-Not here: how the offsets are found (denoising/alignment.py).
+Not here: how far (denoising/rounding.py, denoising/alignment.py).
 """
 
 from __future__ import annotations
@@ -27,6 +27,10 @@ AlignBy = Annotated[
         " such groups onto each other. A model adapted by train says so itself.",
     ),
 ]
+Unround = Annotated[
+    bool,
+    option("--unround/--keep-rounded", help="Bring depths that a depth camera rounded to steps back between the steps."),
+]
 _MOST_GROUPS = 50  # of which --verbose says how they are shifted
 
 
@@ -44,8 +48,8 @@ def columns(text: str | None) -> tuple[str, ...] | None:
 
 def shift(
     scan: Scan, seen: Mask, model: Model | None, config: DenoiseConfig, console: Console, on_progress: Progress
-) -> tuple[Points | None, Figures]:
-    """(N, 3) by how much rows are moved so that groups of them meet, if they are to be aligned, and figures of that.
+) -> tuple[Points, Figures]:
+    """(N, 3) by how much rows are moved before they are cleaned, and figures of that: none where none is moved.
 
     seen (N,): rows that have a say; the others stay. Raises ScanError for columns that the settings name and the scan has not.
     """
@@ -55,18 +59,20 @@ def shift(
     from pcdenoise.denoising.alignment import columns_asked_for, groups_asked_for
 
     groups = groups_asked_for(scan, model, config, lambda fault: console.note(f"{fault}; cleaned as it is"))
+    moved, points = np.zeros((len(scan), 3)), scan.points[seen]
+    moved[seen], figures = denoiser.unrounding(points, config)
     if groups is None:
-        return None, {}
+        return moved, figures
     on_progress("aligning", 0.0)
-    moved, names = np.zeros((len(scan), 3)), columns_asked_for(model, config)
-    moved[seen], figures = denoiser.shift_of(scan.points[seen], groups[seen], model, config)
+    offsets, names = np.zeros((len(scan), 3)), columns_asked_for(model, config)
+    offsets[seen], found = denoiser.shift_of(points + moved[seen], groups[seen], model, config)
     rows, sizes = np.unique(groups, return_index=True, return_counts=True)[1:]
     for row, n in zip(rows[:_MOST_GROUPS], sizes, strict=False):
         values = ", ".join(f"{name} {scan.attributes[name][row]}" for name in names)
-        console.detail(f"{values}: {counted(int(n), 'point')} shifted by {', '.join(map(figure, moved[row]))}")
+        console.detail(f"{values}: {counted(int(n), 'point')} shifted by {', '.join(map(figure, offsets[row]))}")
     if len(rows) > _MOST_GROUPS:
         console.detail(f"and {len(rows) - _MOST_GROUPS:,} more groups")
-    return moved, {"aligned_by": ",".join(names), **figures}
+    return moved + offsets, {**figures, "aligned_by": ",".join(names), **found}
 
 
 def note_unaligned(source: str, model: Model | None, config: DenoiseConfig, console: Console) -> None:

@@ -308,6 +308,8 @@ def _summary(figures: Figures) -> str:
     parts = [counted(figures["points"], "point")]
     if "points_selected" in figures:
         parts.append(f"{figures['points_selected']:,} selected")
+    if "rounded_axis" in figures:
+        parts.append(f"{figures['rounded_axis']} was rounded in steps of {figure(figures['rounding_step'])}")
     if "aligned_by" in figures:
         off = f"off by {figure(figures['offset'])}" if figures["offset"] else "which agree"
         parts.append(f"{figures['groups']:,} groups by {figures['aligned_by']} {off}" if figures["groups"] > 1 else "one group")

@@ -59,6 +59,7 @@ def denoise(
     draws: Draws = 1,
     noise: options.Noise = None,
     align_by: aligning.AlignBy = None,
+    unround: aligning.Unround = True,
     unshrink: Unshrink = None,
     neighbours: Neighbours = None,
     radius: Radius = None,
@@ -130,8 +131,8 @@ def denoise(
 
     settings = configured(
         DenoiseConfig, method=method, iters=iters, draws=draws, noise=noise, align_by=aligning.columns(align_by),
-        strength=strength, max_move=max_move, outliers=outliers, unshrink=unshrink, neighbours=neighbours, radius=radius,
-        sigma_d=sigma_d, sigma_n=sigma_n, uncertainty=uncertainty, seed=seed, threads=threads,
+        unround=unround, strength=strength, max_move=max_move, outliers=outliers, unshrink=unshrink, neighbours=neighbours,
+        radius=radius, sigma_d=sigma_d, sigma_n=sigma_n, uncertainty=uncertainty, seed=seed, threads=threads,
     )  # fmt: skip
     console, sources = Console(quiet, verbose), expand(inputs)
     share = files.shard(sources, shard) if shard else sources

@@ -83,11 +83,10 @@ def _noise_of_rows(scan: Scan, seed: int, threads: int) -> NDArray[np.float64]:
     import numpy as np
 
     from pcdenoise.cloud import noise_level
-    from pcdenoise.commands.survey import noise_of
+    from pcdenoise.commands.survey import as_cleaned
 
-    points = scan.points[scan.finite]
+    points, level, _ = as_cleaned(scan.points[scan.finite], seed, threads)
     values = np.full(len(scan), np.nan)
-    level = noise_of(points, seed, threads)
     values[scan.finite] = noise_level.around(points, level, seed=seed, threads=threads)
     return values
 

@@ -28,6 +28,7 @@ def iterate(
     draws: Draws = 1,
     noise: options.Noise = None,
     align_by: aligning.AlignBy = None,
+    unround: aligning.Unround = True,
     unshrink: Unshrink = None,
     neighbours: Neighbours = None,
     radius: Radius = None,
@@ -57,7 +58,8 @@ def iterate(
 
     settings = configured(
         DenoiseConfig, method=method, iters=iters, draws=draws, noise=noise, align_by=aligning.columns(align_by),
-        unshrink=unshrink, neighbours=neighbours, radius=radius, sigma_d=sigma_d, sigma_n=sigma_n, seed=seed, threads=threads,
+        unround=unround, unshrink=unshrink, neighbours=neighbours, radius=radius, sigma_d=sigma_d, sigma_n=sigma_n, seed=seed,
+        threads=threads,
     )  # fmt: skip
     strip, report = output / "passes.png", output / "report.html"
     refuse_folder(output)

@@ -29,10 +29,6 @@ _MOST_JUDGED = 200_000  # points of which outliers are counted
 _BLOCKS = 4  # compact parts of the cloud that they are taken from
 _MANY_OUTLIERS = 1e-3
 _MOST_DEGREES = (180.0, 90.0)
-_LEAST_DEPTHS, _POINTS_PER_DEPTH, _DEPTHS_NEARBY, _WIDTH = 32, 200, 2, 0.2
-"""Depths are rounded where there are so many at least, each of so many points on average, no more of them around most points, and
-those points so wide for their length: the floors and stairs of a drawing are fewer planes, the rows of a scanner are lines."""
-_DEPTH_SAMPLE, _DEPTH_PROBES = 100_000, 500
 
 
 def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
@@ -43,6 +39,7 @@ def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
                      noise_p95.
     surface_share    of the points around which a surface shows.
     outlier_share    of points that are no sample of any surface, from up to 200 000 points.
+    rounded_axis, rounding_step    where depths were rounded: noise, spacing and density are of points back between the steps.
     """
     import numpy as np
 
@@ -73,8 +70,9 @@ def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
     }
     if len(places) < 2:
         return found | {"warnings": traps(scan, None)}
+    points, level, rounded = as_cleaned(points, seed, threads)
+    places = points[distinct(points)[0]]
     places = places[spatial_order(places)]
-    level = noise_of(points, seed, threads)
     probes = places[np.sort(np.random.default_rng(seed).choice(len(places), min(noise_level.N_PROBES, len(places)), False))]
     k = min(N_NEIGHBOURS, len(places))
     radius = float(np.median(NeighbourSearch(places, threads).knn(probes, k)[0][:, -1]))
@@ -93,22 +91,27 @@ def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
         "outlier_share": _outlier_share(places, threads),
         "suggested_model": "default" if level.is_surface else None,
         "suggested_iters": 1 if level.is_surface else 0,
+        **rounded,
         **cost(len(scan)),
     }
     said = traps(scan, level.std if level.is_surface else None)
+    if rounded:
+        step = f"{rounded['rounded_axis']} was rounded, in steps of {rounded['rounding_step']:.2g} at most points"
+        said.append(f"{step}; denoise brings depths back between the steps, and the noise told here is what is left then")
     if found["outlier_share"] > _MANY_OUTLIERS:
         said.append("many points belong to no surface; --outliers flag marks them, --outliers remove leaves them out")
     return found | {"warnings": said}
 
 
-def noise_of(points: Points, seed: int, threads: int) -> NoiseLevel:
-    """The noise of (N, 3) finite points, as the default model would clean them by."""
+def as_cleaned(points: Points, seed: int, threads: int) -> tuple[Points, NoiseLevel, dict[str, Any]]:
+    """(N, 3) finite points as the default model would be given them, their noise, and figures of depths that were rounded."""
     from pcdenoise.config import DenoiseConfig
-    from pcdenoise.denoising.denoiser import level_of
+    from pcdenoise.denoising.denoiser import level_of, unrounding
     from pcdenoise.networks import store
 
     config = DenoiseConfig.model_validate({"seed": seed, "threads": threads if threads > 0 else None})
-    return level_of(points, store.load(), config)
+    shift, rounded = unrounding(points, config)
+    return points + shift, level_of(points, store.load(), config, shift), rounded
 
 
 def cost(n_points: int, n_passes: float = 1, n_draws: int = 1) -> dict[str, float]:
@@ -162,44 +165,10 @@ def traps(scan: Scan, noise: float | None) -> list[str]:
         return said
     if (step := io.coordinate_step(scan)) and noise < step:
         said.append(f"the noise is below the file's step of {step:g}, and moves below half of it vanish; write .ply to keep them")
-    rounded = _rounded_depths(points, noise)
-    for axis, std in rounded.items():
-        fix = f"--noise {std:.2g} tells how far off they are"
-        said.append(
-            f"{axis} was rounded, in steps of {std * math.sqrt(12):.2g} at most points, so that neighbours show no noise; {fix}"
-        )
-    if (step := _float32_step(points)) > noise / 4 and not rounded:
+    if (step := _float32_step(points)) > noise / 4:
         fix = "export from the source in float64, or with an offset"
         said.append(f"coordinates were rounded to float32, in steps of {step:g} so far from the origin; {fix}")
     return said
-
-
-def _rounded_depths(points: Points, noise: float) -> dict[str, float]:
-    """Axes along which points lie on few planes, as depth cameras measure, and the standard deviation of that, unless it shows.
-
-    Around most points the nearest others lie on one or two planes, and all over them. Rows of a grid or of a line scanner are
-    planes as well, but then the nearest others lie on several of them, or along a line.
-    """
-    import numpy as np
-
-    from pcdenoise.cloud.neighbours import knn
-
-    some = points[:: 1 + len(points) // _DEPTH_SAMPLE]
-    stds: dict[int, float] = {}
-    for axis in range(3):
-        planes, plane = np.unique(some[:, axis], return_inverse=True)
-        if _LEAST_DEPTHS <= len(planes) <= len(some) / _POINTS_PER_DEPTH:
-            std = float(np.median(np.gradient(planes)[plane])) / math.sqrt(12)
-            stds |= {axis: std} if noise < std / 2 else {}
-    if not stds:
-        return {}
-    probes = points[np.linspace(0, len(points) - 1, _DEPTH_PROBES).astype(int)]
-    near = points[knn(points, N_NEIGHBOURS, probes)[1]]
-    n_planes = np.median((np.diff(np.sort(near, axis=1), axis=1) > 0).sum(axis=1) + 1, axis=0)
-    near = near - near.mean(axis=1, keepdims=True)
-    squared = np.linalg.eigvalsh(near.transpose(0, 2, 1) @ near)
-    is_flat = np.median(squared[:, 1] / np.maximum(squared[:, 2], 1e-300)) > _WIDTH**2
-    return {"xyz"[axis]: std for axis, std in stds.items() if is_flat and n_planes[axis] <= _DEPTHS_NEARBY}
 
 
 def _misfit(system: Crs, points: Points) -> str:

@@ -19,7 +19,7 @@ from pcdenoise.cloud.neighbours import Identity, coordinate_hash, distinct_by, d
 from pcdenoise.cloud.noise_level import NoiseLevel, by_place, estimate_at, probes
 from pcdenoise.cloud.scan import Mask, Points, check_extent, within
 from pcdenoise.config import DenoiseConfig
-from pcdenoise.denoising import classical, network_pass, outliers, taken_off, uncertainty
+from pcdenoise.denoising import classical, network_pass, outliers, rounding, taken_off, uncertainty
 from pcdenoise.denoising.alignment import Alignment, Groups, align, heights
 from pcdenoise.denoising.relaxation import relax, without_low_frequencies
 from pcdenoise.denoising.risk import Risk
@@ -82,7 +82,7 @@ def denoise(
 ) -> Result:
     """Moves (N, 3) float64 points onto the surface they were measured on; row i stays row i.
 
-    level: the noise, if it is known. shift (N, 3): where rows are moved before they are cleaned, see `alignment_of`.
+    level: the noise, if it is known. shift (N, 3): by how much rows are moved before that, see `unrounding` and `shift_of`.
     Rows that are not finite stay as they are; exact duplicates move together; the network leaves a cloud in which no scale
     shows a surface as it is. Raises UsageError when the network is asked for without a model.
     """
@@ -147,6 +147,19 @@ def alignment_of(points: Points, groupings: list[Groups], model: Model | None, c
     first = heights(cloud.start, cleaned(cloud.start), cloud.threads)
     pairs = zip(groupings, unmoved, strict=True)
     return [align(cloud.start, cloud.of_rows(groups), none, first, cleaned, cloud.threads) for groups, none in pairs]
+
+
+def unrounding(points: Points, config: DenoiseConfig) -> tuple[Points, dict[str, Any]]:
+    """(N, 3) by how much each row is moved so that depths that a camera rounded lie between their steps, and figures of that.
+
+    Figures: rounded_axis, rounding_step; none where nothing was rounded, or is to stay so, and nothing moves.
+    """
+    finite = np.logical_and.reduce(np.isfinite(points), axis=1)
+    found, moved = rounding.find(points[finite]) if config.unround else None, np.zeros_like(points)
+    if found is None:
+        return moved, {}
+    moved[finite] = rounding.shift(points[finite], found, config.threads or os.cpu_count() or 1)
+    return moved, {"rounded_axis": "xyz"[found.axis], "rounding_step": found.step}
 
 
 def shift_of(points: Points, group: Groups, model: Model | None, config: DenoiseConfig) -> tuple[Points, dict[str, float]]:
