@@ -156,6 +156,8 @@ def test_denoise_undoes_rounding_first_and_says_so_unless_it_is_to_stay(
 
     assert error(clean) < 0.4 * error(kept)
     assert pcdenoise.denoise(points, threads=1).figures["rounded_axis"] == "z"
+    assert main(["denoise", str(scan), "-o", str(tmp_path / "cells.ply"), "--tile", "20000"]) == 0
+    assert "rounded stay so" in capsys.readouterr().err
     assert main(["undo", str(clean), "-o", str(tmp_path / "back.ply")]) == 0
     assert pcdenoise.read(tmp_path / "back.ply").points[known].tobytes() == points[known].tobytes()
     assert main(["info", str(scan)]) == 0

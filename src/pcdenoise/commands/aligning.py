@@ -75,9 +75,14 @@ def shift(
     return moved + offsets, {**figures, "aligned_by": ",".join(names), **found}
 
 
-def note_unaligned(source: str, model: Model | None, config: DenoiseConfig, console: Console) -> None:
-    """Says that a scan that is cleaned in cells is not aligned, where its model asks for that."""
+def note_unshifted(source: str, some: Points, model: Model | None, config: DenoiseConfig, console: Console) -> None:
+    """Says that nothing is shifted in a scan that is cleaned in cells, where some of its points or its model ask for that."""
+    import numpy as np
+
+    from pcdenoise.denoising import rounding
     from pcdenoise.denoising.alignment import columns_asked_for
 
+    if config.unround and rounding.find(some[np.logical_and.reduce(np.isfinite(some), axis=1)]):
+        console.note(f"{source}: depths that a camera rounded stay so: cleaned in cells; raise --max-memory or leave out --tile")
     if names := columns_asked_for(model, config):
         console.note(f"{source}: not aligned by {','.join(names)} as the model asks: cleaned in cells")

@@ -198,13 +198,13 @@ class Cleaning:
 
         started = time.perf_counter()
         self._refuse_cells(job, stream)
-        aligning.note_unaligned(str(job.source), self.model, self.config, self.console)
         cell_points = self.tile or points_per_cell(self.max_bytes)
         job.target.parent.mkdir(parents=True, exist_ok=True)
         folder = cells_of(job)
         about = job.source.stat()
-        for piece in islice(stream.pieces(1), 1):
+        for piece in islice(stream.pieces(_PIECE_ROWS), 1):
             self._refuse(job, piece)
+            aligning.note_unshifted(str(job.source), piece.points, self.model, self.config, self.console)
 
         def read() -> Iterator[Scan]:
             for piece in stream.pieces(_PIECE_ROWS):
