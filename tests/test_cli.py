@@ -319,7 +319,8 @@ def test_a_signal_ends_the_command_with_its_code_and_leaves_nothing(number: sign
 @pytest.mark.parametrize("added", [[], ["--uncertainty"], ["--outliers=flag"], ["--uncertainty", "--outliers=flag"]])
 @pytest.mark.parametrize("format", ["xyz", "ply", "pcd", "las", "laz"])
 def test_undo_gives_back_the_very_coordinates_and_attributes(format: str, added: list[str], sphere: Path) -> None:
-    original, clean, back = (sphere.with_name(f"{name}.{format}") for name in ("original", "clean", "back"))
+    original, clean = (sphere.with_name(f"{name}.{format}") for name in ("original", "clean"))
+    back = sphere.parent / "not" / "there" / f"back.{format}"
     pcdenoise.write(pcdenoise.read(sphere), original)
     assert main(["denoise", str(original), "-o", str(clean), "--displacement", *added, "-q", *FAST]) == 0
     before, moved = pcdenoise.read(original), pcdenoise.read(clean)

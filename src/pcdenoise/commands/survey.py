@@ -103,7 +103,7 @@ def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
     return found | {"warnings": said}
 
 
-def as_cleaned(points: Points, seed: int, threads: int) -> tuple[Points, NoiseLevel, dict[str, Any]]:
+def as_cleaned(points: Points, seed: int = 0, threads: int = -1) -> tuple[Points, NoiseLevel, dict[str, Any]]:
     """(N, 3) finite points as the default model would be given them, their noise, and figures of depths that were rounded."""
     from pcdenoise.config import DenoiseConfig
     from pcdenoise.denoising.denoiser import level_of, unrounding

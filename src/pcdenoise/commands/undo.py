@@ -57,6 +57,7 @@ def undo(
     target = Path(output)
     refuse_unwritable([target], overwrite)
     scan = restored(io.read(clean, format=format_of(clean, format)))
+    target.parent.mkdir(parents=True, exist_ok=True)
     io.write(scan, target, format=format_of(target, format), overwrite=overwrite)
 
 

@@ -70,11 +70,12 @@ def check_drift(path: Path, drift: float, noise: float, limit: float | None) -> 
 def compare(before: Scan, after: Scan, noise: float | None = None) -> dict[str, Any]:
     """What two scans share: attributes row by row, what is beside them, distances moved, drift, and a list of what was lost.
 
-    noise: the standard deviation that there was, in the scans' unit, where somebody knows it; else it is estimated.
+    noise: the standard deviation that there was, in the scans' unit, where somebody knows it; else as `info` reads it.
     """
     import numpy as np
 
-    from pcdenoise.cloud import drift, noise_level
+    from pcdenoise.cloud import drift
+    from pcdenoise.commands.survey import as_cleaned
 
     if len(before) != len(after):
         lost = [f"{len(before)} rows became {len(after)}"]
@@ -103,7 +104,7 @@ def compare(before: Scan, after: Scan, noise: float | None = None) -> dict[str, 
         lost.append("rows without numbers (NaN, infinite) are not the same rows")
     both = before.finite & after.finite
     move = np.linalg.norm(after.points[both] - before.points[both], axis=1)
-    noise = noise or noise_level.estimate(before.points[both]).std
+    noise = noise or as_cleaned(before.points[both])[1].std
     drifted = drift.measure(before.points[both], after.points[both])
     return {
         "rows": [len(before), len(after)],
