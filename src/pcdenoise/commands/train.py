@@ -71,7 +71,7 @@ def train(
     budget: Annotated[
         str | None,
         option(
-            "--budget", metavar="TIME", help="Learn for so long: 90s, 20m, 1.5h, then judge it, in a minute at most. By default 20m."
+            "--budget", metavar="TIME", help="Learn for so long: 90s, 20m, 1.5h, then judge for up to a minute. By default 20m."
         ),
     ] = None,
     init: Annotated[
