@@ -62,7 +62,8 @@ class NoiseLevel:
     scale_points: how many nearest points show a surface rather than a ball of noise; it grows as std² times density.
     is_surface: whether any scale shows one (False: vegetation, clutter, a filled volume).
     is_known: whether somebody told the std. n_points: distinct points of the cloud that it was read from. times_read: how many
-    times what neighbours disagree by the std is, where something else says so.
+    times what neighbours disagree by the std is, where something else says so. least: std (M,) that there is at (M, 3) places of
+    the cloud whatever neighbours show, where somebody knows.
     """
 
     std: float
@@ -72,6 +73,7 @@ class NoiseLevel:
     is_known: bool = False
     n_points: int = 0
     times_read: float = 1.0
+    least: Callable[[Points], NDArray[np.float64]] | None = None
 
     def times(self, factor: float) -> NoiseLevel:
         """The level of so many times the noise; the scale goes with its square, as the points of a disc do."""
@@ -177,6 +179,8 @@ def by_place(points: Points, identity: Identity, level: NoiseLevel, threads: int
     Noise that is known, and that of places without a surface, is the level's. Places are drawn by identity (N,), and what is read
     there and spread from there lies near, so that a part of a cloud gives what the whole does.
     """
+    if level.least is not None:
+        return np.maximum(level.least(points), by_place(points, identity, replace(level, least=None), threads))
     if level.times_read != 1:
         return level.times_read * by_place(points, identity, level.as_read, threads)
     everywhere, share = np.full(len(points), level.std), level.share_of_noise

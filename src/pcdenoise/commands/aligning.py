@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pcdenoise.cloud.scan import Mask, Points, Scan
     from pcdenoise.config import DenoiseConfig
     from pcdenoise.denoising.denoiser import Progress
+    from pcdenoise.denoising.rounding import Rounding
     from pcdenoise.networks.store import Model
 
 AlignBy = Annotated[
@@ -48,8 +49,8 @@ def columns(text: str | None) -> tuple[str, ...] | None:
 
 def shift(
     scan: Scan, seen: Mask, model: Model | None, config: DenoiseConfig, console: Console, on_progress: Progress
-) -> tuple[Points, Figures]:
-    """(N, 3) by how much rows are moved before they are cleaned, and figures of that: none where none is moved.
+) -> tuple[Points, Rounding | None, Figures]:
+    """(N, 3) by how much rows are moved before they are cleaned, how depths were rounded, and figures of both.
 
     seen (N,): rows that have a say; the others stay. Raises ScanError for columns that the settings name and the scan has not.
     """
@@ -60,9 +61,10 @@ def shift(
 
     groups = groups_asked_for(scan, model, config, lambda fault: console.note(f"{fault}; cleaned as it is"))
     moved, points = np.zeros((len(scan), 3)), scan.points[seen]
-    moved[seen], figures = denoiser.unrounding(points, config)
+    moved[seen], rounded = denoiser.unrounding(points, config)
+    figures = {} if rounded is None else rounded.figures
     if groups is None:
-        return moved, figures
+        return moved, rounded, figures
     on_progress("aligning", 0.0)
     offsets, names = np.zeros((len(scan), 3)), columns_asked_for(model, config)
     offsets[seen], found = denoiser.shift_of(points + moved[seen], groups[seen], model, config)
@@ -72,7 +74,7 @@ def shift(
         console.detail(f"{values}: {counted(int(n), 'point')} shifted by {', '.join(map(figure, offsets[row]))}")
     if len(rows) > _MOST_GROUPS:
         console.detail(f"and {len(rows) - _MOST_GROUPS:,} more groups")
-    return moved + offsets, {**figures, "aligned_by": ",".join(names), **found}
+    return moved + offsets, rounded, {**figures, "aligned_by": ",".join(names), **found}
 
 
 def note_unshifted(source: str, some: Points, model: Model | None, config: DenoiseConfig, console: Console) -> None:

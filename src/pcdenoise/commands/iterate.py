@@ -76,8 +76,9 @@ def iterate(
     passes = [_Pass(scan.points, truth.errors(scan.points))]
     console = Console(quiet)
     with console.progress(source.name) as on_progress:
-        shift, aligned = aligning.shift(scan, np.ones(len(scan), bool), weights, settings, console, on_progress)
-        for number, step in enumerate(denoiser.iterate(scan.points, weights, settings, shift=shift), start=1):
+        shift, rounded, before = aligning.shift(scan, np.ones(len(scan), bool), weights, settings, console, on_progress)
+        steps = denoiser.iterate(scan.points, weights, settings, shift=shift, rounded=rounded)
+        for number, step in enumerate(steps, start=1):
             on_progress(f"pass {number}", 0.0 if settings.iters == "auto" else number / settings.iters)
             output.mkdir(parents=True, exist_ok=True)
             io.write(
@@ -89,7 +90,7 @@ def iterate(
     output.mkdir(parents=True, exist_ok=True)  # a scan without a surface has no pass
     print(_as_text(passes))
     _save_strip(strip, scan, passes, overwrite)
-    _save_report(report, scan, passes, {**named, **aligned}, overwrite)
+    _save_report(report, scan, passes, {**named, **before}, overwrite)
     console.note(f"{output}: {counted(len(passes) - 1, 'pass', 'passes')}, {strip.name}, {report.name}")
 
 

@@ -111,7 +111,8 @@ def as_cleaned(points: Points, seed: int = 0, threads: int = -1) -> tuple[Points
 
     config = DenoiseConfig.model_validate({"seed": seed, "threads": threads if threads > 0 else None})
     shift, rounded = unrounding(points, config)
-    return points + shift, level_of(points, store.load(), config, shift), rounded
+    level = level_of(points, store.load(), config, shift, rounded)
+    return points + shift, level, {} if rounded is None else rounded.figures
 
 
 def cost(n_points: int, n_passes: float = 1, n_draws: int = 1) -> dict[str, float]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -23,6 +23,7 @@ from pcdenoise.denoising import classical, network_pass, outliers, rounding, tak
 from pcdenoise.denoising.alignment import Alignment, Groups, align, heights
 from pcdenoise.denoising.relaxation import relax, without_low_frequencies
 from pcdenoise.denoising.risk import Risk
+from pcdenoise.denoising.rounding import Rounding
 from pcdenoise.errors import UsageError
 from pcdenoise.networks.store import Model, ProjectionSettings
 
@@ -79,14 +80,16 @@ def denoise(
     *,
     level: NoiseLevel | None = None,
     shift: Points | None = None,
+    rounded: Rounding | None = None,
 ) -> Result:
     """Moves (N, 3) float64 points onto the surface they were measured on; row i stays row i.
 
     level: the noise, if it is known. shift (N, 3): by how much rows are moved before that, see `unrounding` and `shift_of`.
+    rounded: what was undone by that, so that something of it is left.
     Rows that are not finite stay as they are; exact duplicates move together; the network leaves a cloud in which no scale
     shows a surface as it is. Raises UsageError when the network is asked for without a model.
     """
-    cloud = _Cloud(points, model, config, level, shift)
+    cloud = _Cloud(points, model, config, level, shift, rounded)
     found = np.zeros(len(points), dtype=bool)
     if config.outliers != "keep" and len(cloud.start) >= FEWEST_POINTS:
         found = cloud.to_rows(outliers.find(cloud.aligned, level=cloud.level.as_read, threads=cloud.threads), False)
@@ -123,9 +126,15 @@ def denoise(
     return Result(placed[-1].points if placed else points.copy(), found, unmoved, figures, placed, std)
 
 
-def level_of(points: Points, model: Model | None, config: DenoiseConfig, shift: Points | None = None) -> NoiseLevel:
+def level_of(
+    points: Points,
+    model: Model | None,
+    config: DenoiseConfig,
+    shift: Points | None = None,
+    rounded: Rounding | None = None,
+) -> NoiseLevel:
     """The noise level by which `denoise` would clean (N, 3) points."""
-    return _Cloud(points, model, config, shift=shift).level
+    return _Cloud(points, model, config, None, shift, rounded).level
 
 
 def alignment_of(points: Points, groupings: list[Groups], model: Model | None, config: DenoiseConfig) -> list[Alignment]:
@@ -149,17 +158,14 @@ def alignment_of(points: Points, groupings: list[Groups], model: Model | None, c
     return [align(cloud.start, cloud.of_rows(groups), none, first, cleaned, cloud.threads) for groups, none in pairs]
 
 
-def unrounding(points: Points, config: DenoiseConfig) -> tuple[Points, dict[str, Any]]:
-    """(N, 3) by how much each row is moved so that depths that a camera rounded lie between their steps, and figures of that.
-
-    Figures: rounded_axis, rounding_step; none where nothing was rounded, or is to stay so, and nothing moves.
-    """
+def unrounding(points: Points, config: DenoiseConfig) -> tuple[Points, Rounding | None]:
+    """(N, 3) by how much each row is moved so that depths that a camera rounded lie between their steps; and how they were
+    rounded, None where nothing was, or is to stay so, and nothing moves."""
     finite = np.logical_and.reduce(np.isfinite(points), axis=1)
     found, moved = rounding.find(points[finite]) if config.unround else None, np.zeros_like(points)
-    if found is None:
-        return moved, {}
-    moved[finite] = rounding.shift(points[finite], found, config.threads or os.cpu_count() or 1)
-    return moved, {"rounded_axis": "xyz"[found.axis], "rounding_step": found.step}
+    if found is not None:
+        moved[finite] = rounding.shift(points[finite], found, config.threads or os.cpu_count() or 1)
+    return moved, found
 
 
 def shift_of(points: Points, group: Groups, model: Model | None, config: DenoiseConfig) -> tuple[Points, dict[str, float]]:
@@ -170,9 +176,17 @@ def shift_of(points: Points, group: Groups, model: Model | None, config: Denoise
     return shift, {"groups": len(alignment), "offset": offset}
 
 
-def iterate(points: Points, model: Model | None, config: DenoiseConfig, *, shift: Points | None = None) -> Iterator[Step]:
-    """Pass after pass, each fed with the last one's output: (N, 3) points and figures of every step. shift as of `denoise`."""
-    cloud = _Cloud(points, model, config, shift=shift)
+def iterate(
+    points: Points,
+    model: Model | None,
+    config: DenoiseConfig,
+    *,
+    shift: Points | None = None,
+    rounded: Rounding | None = None,
+) -> Iterator[Step]:
+    """Pass after pass, each fed with the last one's output: (N, 3) points and figures of every step. shift, rounded as of
+    `denoise`."""
+    cloud = _Cloud(points, model, config, None, shift, rounded)
     for step in _passes(cloud, model, config, lambda _task, _share: None, is_judged=True):
         yield Step(cloud.placed(step.points), step.figures)
 
@@ -190,6 +204,7 @@ class _Cloud:
         config: DenoiseConfig,
         level: NoiseLevel | None = None,
         shift: Points | None = None,
+        rounded: Rounding | None = None,
     ) -> None:
         self.config, self.rows = config, points
         self.threads = config.threads or os.cpu_count() or 1
@@ -209,7 +224,9 @@ class _Cloud:
         self.reached = self.aligned
         self.identity: Identity = identity[first][order]
         self.probes = probes(drawn_by(self.identity, config.seed))
-        self.level: NoiseLevel = level or self._level(model)
+        level = level or self._level(model)
+        left = None if rounded is None else lambda points: rounded.left(points + self.origin)
+        self.level: NoiseLevel = replace(level, least=left)
         self.diagonal = float(np.linalg.norm(np.ptp(self.start, axis=0))) if len(self.start) else 0.0
 
     def _level(self, model: Model | None) -> NoiseLevel:

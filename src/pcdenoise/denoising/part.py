@@ -9,6 +9,7 @@ import numpy as np
 from pcdenoise.cloud.scan import Mask, Points
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising.denoiser import Progress, Result, denoise, level_of
+from pcdenoise.denoising.rounding import Rounding
 from pcdenoise.networks.store import Model
 
 _REACH_SPACINGS = 64.0
@@ -24,6 +25,7 @@ def denoise_part(
     on_progress: Progress | None = None,
     *,
     shift: Points | None = None,
+    rounded: Rounding | None = None,
 ) -> Result:
     """`denoise`, but only `movable` rows (N,) move, and only `seen` rows (N,) have a say; every other row keeps each bit.
 
@@ -43,7 +45,8 @@ def denoise_part(
     else:
         worked &= False
     rows = np.flatnonzero(worked)
-    result = denoise(points[rows], model, config, on_progress, level=level, shift=None if shift is None else shift[rows])
+    moved = None if shift is None else shift[rows]
+    result = denoise(points[rows], model, config, on_progress, level=level, shift=moved, rounded=rounded)
 
     chosen = movable[rows]
     moved, outlier, left_alone = points.copy(), np.zeros(len(points), np.bool_), np.ones(len(points), np.bool_)
