@@ -6,7 +6,7 @@ neighbours show no noise at all. Not here: noise that neighbours show (cloud.noi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -37,7 +37,7 @@ class Rounding:
 
     axis: int
     step: float
-    depths: Floats
+    depths: Floats = field(repr=False)
 
     @property
     def figures(self) -> dict[str, Any]:
@@ -114,8 +114,10 @@ def _between(step: Floats, image: Points, threads: int) -> Floats:
     own = np.repeat(np.arange(n), k)[is_linked.ravel()]
     links = sparse.csr_matrix((np.ones(len(own)), (own, other[is_linked])), shape=(n, n))
     links = links.maximum(links.T)
-    laplacian = (sparse.diags(np.asarray(links.sum(axis=1)).ravel()) - links).tocsr() / _NEIGHBOURS
-    rate = 1 / (4 * _BENDING + 2 * (1 - _BENDING) + _PULL)  # about one over the largest curvature of what is minimised
+    degree = np.asarray(links.sum(axis=1)).ravel() / _NEIGHBOURS
+    laplacian = (sparse.diags(degree) - links / _NEIGHBOURS).tocsr()
+    stiffest = 2 * float(degree.max())  # no eigenvalue of L is larger
+    rate = 1 / (_BENDING * stiffest**2 + (1 - _BENDING) * stiffest + _PULL)
     furthest = np.where(is_linked.all(axis=1), _FURTHEST_STEPS, 0.0)
     now = ahead = step
     momentum = 1.0
