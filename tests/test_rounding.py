@@ -131,8 +131,49 @@ def test_points_beside_an_edge_stay_and_things_behind_one_another_do_not_meet() 
     assert (moved[is_edge.ravel()] == points[is_edge.ravel()]).all()
 
 
+def test_depths_that_nothing_has_are_steps_as_well() -> None:
+    """A board before a frontal wall: between the two there are a hundred steps at which no point lies."""
+    ray = rays()
+    depth = np.where(np.abs(ray[:, 1]) < 0.25, 1 / (0.85 + 0.25 * ray[:, 1]), 3.0)
+    points = ray * measured(depth)[:, None]
+    moved = undone(points)
+    assert (np.abs(moved[:, 2] - points[:, 2]) < 1.05 * steps_at(points[:, 2])).all()
+    found = rounding.find(points)
+    assert found is not None
+    assert found.left(points) == pytest.approx(0.5 / np.sqrt(12) * steps_at(points[:, 2]), rel=1e-6)
+    assert np.sqrt(((moved[:, 2] - depth) ** 2).mean()) < np.sqrt(((points[:, 2] - depth) ** 2).mean())
+
+
+def test_a_stray_point_changes_nothing_for_the_others() -> None:
+    points = rays() * measured(wall())[:, None]
+    for stray in ([2.0, 0.0, 0.5], [0.0, 0.0, -0.01], [0.1, 0.1, 0.0]):
+        assert np.abs(undone(np.vstack([points, stray]))[:-1] - undone(points)).max() < 1e-12
+
+
+def test_where_most_points_lie_behind_one_another_nothing_moves() -> None:
+    """Leaves in slices that are whole steps apart."""
+    rng = np.random.default_rng(4)
+    points = np.column_stack([rng.uniform(0, 10, (60_000, 2)), 0.8 * rng.integers(0, 50, 60_000)])
+    found = rounding.find(points)
+    assert found is not None
+    assert not rounding.shift(points, found).any()
+    assert "rounded_axis" not in pcdenoise.denoise(points, threads=1).figures
+
+
+def test_no_pass_at_all_still_undoes_rounding_and_told_noise_is_what_is_told() -> None:
+    points = rays() * measured(wall())[:, None]
+    assert np.abs(pcdenoise.denoise(points, threads=1, iters="auto").points - undone(points)).max() < 0.5 * UNIT * 3.9**2
+    assert (pcdenoise.denoise(points, threads=1, strength=0).points == points).all()
+    told = [pcdenoise.denoise(points, threads=1, noise=noise).points for noise in (1e-6, 0.02)]
+    assert np.abs(told[0] - undone(points)).max() < 1e-4
+    assert np.abs(told[1] - told[0]).max() > 1e-4
+
+
 def test_other_clouds_are_not_taken_for_rounded() -> None:
-    """Noise; noise rounded along all axes; a grid of heights; rows of a line scanner; ten storeys; too few points."""
+    """Noise; noise rounded along all axes; a grid of heights; rows of a line scanner; ten storeys; too few points; exact walls
+    that stand anywhere."""
+    rng = np.random.default_rng(2)
+    walls = [np.insert(rng.uniform(0, 9, (600, 2)), 0, np.round(rng.uniform(0, 50), 2), axis=1) for _ in range(40)]
     noisy = cloud("sphere", 20_000, 0.5).noisy
     u, v = (axis.ravel() for axis in np.meshgrid(np.arange(300.0), np.arange(200.0)))
     waves = np.sin(u / 60) * np.cos(v / 50)
@@ -140,6 +181,7 @@ def test_other_clouds_are_not_taken_for_rounded() -> None:
     for points in (
         noisy, np.round(noisy, 2), np.round(noisy, 1), np.column_stack([u, v, waves]), np.column_stack([u, 12 * v, waves]),
         storeys, storeys + 1e-3 * waves[:, None], noisy[:5], noisy[:0], np.zeros((9000, 3)),
+        np.concatenate(walls),
     ):  # fmt: skip
         assert rounding.find(points) is None
 
@@ -167,6 +209,9 @@ def test_denoise_undoes_rounding_first_and_says_so_unless_it_is_to_stay(
     assert pcdenoise.denoise(points, threads=1).figures["rounded_axis"] == "z"
     assert main(["denoise", str(scan), "-o", str(tmp_path / "cells.ply"), "--tile", "20000"]) == 0
     assert "rounded stay so" in capsys.readouterr().err
+    for option, is_said in (([], True), (["--keep-rounded"], False)):
+        assert main(["denoise", str(scan), "--dry-run", *option]) == 0
+        assert ("z was rounded" in capsys.readouterr().out) == is_said
     assert main(["undo", str(clean), "-o", str(tmp_path / "back.ply")]) == 0
     assert pcdenoise.read(tmp_path / "back.ply").points[known].tobytes() == points[known].tobytes()
     assert main(["info", str(scan)]) == 0

@@ -179,7 +179,7 @@ def by_place(points: Points, identity: Identity, level: NoiseLevel, threads: int
     Noise that is known, and that of places without a surface, is the level's. Places are drawn by identity (N,), and what is read
     there and spread from there lies near, so that a part of a cloud gives what the whole does.
     """
-    if level.least is not None:
+    if level.least is not None and not level.is_known:
         return np.maximum(level.least(points), by_place(points, identity, replace(level, least=None), threads))
     if level.times_read != 1:
         return level.times_read * by_place(points, identity, level.as_read, threads)

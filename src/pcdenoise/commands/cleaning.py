@@ -138,7 +138,7 @@ class Cleaning:
         scan = io.read(job.source, format=format_of(job.source, self.format))
         self._refuse(job, scan)
         self.selection.masks(scan)
-        return survey(scan, seed=self.config.seed, threads=self.config.threads or -1)
+        return survey(scan, seed=self.config.seed, threads=self.config.threads or -1, unround=self.config.unround)
 
     def _refuse(self, job: Job, scan: Scan) -> None:
         """Raises ScanError for what could not be added to a scan, or not be written, once it is cleaned."""

@@ -31,7 +31,7 @@ _MANY_OUTLIERS = 1e-3
 _MOST_DEGREES = (180.0, 90.0)
 
 
-def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
+def survey(scan: Scan, seed: int = 0, threads: int = -1, *, unround: bool = True) -> dict[str, Any]:
     """Facts of a scan in its own unit, JSON-ready: counts, extent, density, noise and its spread, system, warnings, cost.
 
     density          points per square unit of surface.
@@ -70,7 +70,7 @@ def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
     }
     if len(places) < 2:
         return found | {"warnings": traps(scan, None)}
-    points, level, rounded = as_cleaned(points, seed, threads)
+    points, level, rounded = as_cleaned(points, seed, threads, unround=unround)
     places = points[distinct(points)[0]]
     places = places[spatial_order(places)]
     probes = places[np.sort(np.random.default_rng(seed).choice(len(places), min(noise_level.N_PROBES, len(places)), False))]
@@ -92,7 +92,7 @@ def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
         "suggested_model": "default" if level.is_surface else None,
         "suggested_iters": 1 if level.is_surface else 0,
         **rounded,
-        **cost(len(scan)),
+        **cost(len(scan), 2 if rounded else 1),
     }
     said = traps(scan, level.std if level.is_surface else None)
     if rounded:
@@ -103,13 +103,15 @@ def survey(scan: Scan, seed: int = 0, threads: int = -1) -> dict[str, Any]:
     return found | {"warnings": said}
 
 
-def as_cleaned(points: Points, seed: int = 0, threads: int = -1) -> tuple[Points, NoiseLevel, dict[str, Any]]:
+def as_cleaned(
+    points: Points, seed: int = 0, threads: int = -1, *, unround: bool = True
+) -> tuple[Points, NoiseLevel, dict[str, Any]]:
     """(N, 3) finite points as the default model would be given them, their noise, and figures of depths that were rounded."""
     from pcdenoise.config import DenoiseConfig
     from pcdenoise.denoising.denoiser import level_of, unrounding
     from pcdenoise.networks import store
 
-    config = DenoiseConfig.model_validate({"seed": seed, "threads": threads if threads > 0 else None})
+    config = DenoiseConfig.model_validate({"seed": seed, "threads": threads if threads > 0 else None, "unround": unround})
     shift, rounded = unrounding(points, config)
     level = level_of(points, store.load(), config, shift, rounded)
     return points + shift, level, {} if rounded is None else rounded.figures

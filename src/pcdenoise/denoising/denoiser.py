@@ -94,7 +94,9 @@ def denoise(
     if config.outliers != "keep" and len(cloud.start) >= FEWEST_POINTS:
         found = cloud.to_rows(outliers.find(cloud.aligned, level=cloud.level.as_read, threads=cloud.threads), False)
     steps = list(_passes(cloud, model, config, on_progress or (lambda _task, _share: None)))
-    moved = steps[-1].points if steps else cloud.start
+    if not steps:
+        cloud.reached = cloud.aligned
+    moved = steps[-1].points if steps else limited(cloud.start, cloud.aligned, config)
     unmoved = cloud.unmoved(moved)
     length = cloud.to_rows(np.linalg.norm(moved - cloud.start, axis=1), np.nan)[cloud.finite] if len(moved) else np.zeros(1)
     drifted = drift.measure(cloud.start, moved, config.seed, cloud.threads)
@@ -123,7 +125,7 @@ def denoise(
             off = uncertainty.estimate(cleaned, cloud.start, cloud.reached, moved, noise, cloud.threads)
         std = cloud.to_rows(off, np.nan)
     placed = [Step(cloud.placed(step.points), step.figures) for step in steps]
-    return Result(placed[-1].points if placed else points.copy(), found, unmoved, figures, placed, std)
+    return Result(placed[-1].points if placed else cloud.placed(moved), found, unmoved, figures, placed, std)
 
 
 def level_of(
@@ -162,10 +164,12 @@ def unrounding(points: Points, config: DenoiseConfig) -> tuple[Points, Rounding 
     """(N, 3) by how much each row is moved so that depths that a camera rounded lie between their steps; and how they were
     rounded, None where nothing was, or is to stay so, and nothing moves."""
     finite = np.logical_and.reduce(np.isfinite(points), axis=1)
-    found, moved = rounding.find(points[finite]) if config.unround else None, np.zeros_like(points)
+    usable, moved = points[finite], np.zeros_like(points)
+    check_extent(usable)
+    found = rounding.find(usable) if config.unround else None
     if found is not None:
-        moved[finite] = rounding.shift(points[finite], found, config.threads or os.cpu_count() or 1)
-    return moved, found
+        moved[finite] = rounding.shift(usable, found, config.threads or os.cpu_count() or 1)
+    return moved, found if moved[finite].any() else None
 
 
 def shift_of(points: Points, group: Groups, model: Model | None, config: DenoiseConfig) -> tuple[Points, dict[str, float]]:
