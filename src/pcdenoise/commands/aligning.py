@@ -84,7 +84,7 @@ def note_unshifted(source: str, some: Points, model: Model | None, config: Denoi
     from pcdenoise.denoising import rounding
     from pcdenoise.denoising.alignment import columns_asked_for
 
-    if config.unround and rounding.find(some[np.logical_and.reduce(np.isfinite(some), axis=1)]):
+    if config.unround and rounding.find(some[np.logical_and.reduce(np.isfinite(some), axis=1)], config.threads or -1):
         console.note(f"{source}: depths that a camera rounded stay so: cleaned in cells; raise --max-memory or leave out --tile")
     if names := columns_asked_for(model, config):
         console.note(f"{source}: not aligned by {','.join(names)} as the model asks: cleaned in cells")

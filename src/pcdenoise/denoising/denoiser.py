@@ -166,9 +166,10 @@ def unrounding(points: Points, config: DenoiseConfig) -> tuple[Points, Rounding 
     finite = np.logical_and.reduce(np.isfinite(points), axis=1)
     usable, moved = points[finite], np.zeros_like(points)
     check_extent(usable)
-    found = rounding.find(usable) if config.unround else None
+    threads = config.threads or os.cpu_count() or 1
+    found = rounding.find(usable, threads) if config.unround else None
     if found is not None:
-        moved[finite] = rounding.shift(usable, found, config.threads or os.cpu_count() or 1)
+        moved[finite] = rounding.shift(usable, found, threads)
     return moved, found if moved[finite].any() else None
 
 

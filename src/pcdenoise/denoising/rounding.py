@@ -62,7 +62,7 @@ class Rounding:
         return _LEFT / 12**0.5 * step
 
 
-def find(points: Points) -> Rounding | None:
+def find(points: Points, threads: int = -1) -> Rounding | None:
     """How depths of (N, 3) finite points were rounded along one axis, as depth cameras do; None where none was.
 
     Around most points the nearest others lie on one or two planes across the axis, and all over them; and planes are whole steps
@@ -79,7 +79,7 @@ def find(points: Points) -> Rounding | None:
     places = part[distinct(part)[0]]
     places = places[spatial_order(places)]
     probes = places[np.linspace(0, len(places) - 1, min(_PROBES, len(places))).astype(int)]
-    near = places[NeighbourSearch(places).knn(probes, _NEARBY)[1]]
+    near = places[NeighbourSearch(places, threads).knn(probes, _NEARBY)[1]]
     n_planes = np.median((np.diff(np.sort(near, axis=1), axis=1) > 0).sum(axis=1) + 1, axis=0)
     near = near - near.mean(axis=1, keepdims=True)
     squared = np.linalg.eigvalsh(near.transpose(0, 2, 1) @ near)
