@@ -51,13 +51,13 @@ def survey(scan: Scan, seed: int = 0, threads: int = -1, *, unround: bool = True
     points = scan.points[scan.finite]
     check_extent(points)
     extent = np.ptp(points, axis=0) if len(points) else np.zeros(3)
-    places = points[distinct(points)[0]]
+    first, _ = distinct(points)
     system = io.coordinate_system(scan)
     found: dict[str, Any] = {
         "format": scan.format,
         "points": len(scan),
         "not_finite": len(scan) - len(points),
-        "duplicates": len(points) - len(places),
+        "duplicates": len(points) - len(first),
         "low": points.min(axis=0).tolist() if len(points) else None,
         "high": points.max(axis=0).tolist() if len(points) else None,
         "extent": extent.tolist(),
@@ -68,10 +68,10 @@ def survey(scan: Scan, seed: int = 0, threads: int = -1, *, unround: bool = True
         "unit": unit_of(scan),
         "coordinate_step": io.coordinate_step(scan),
     }
-    if len(places) < 2:
+    if len(first) < 2:
         return found | {"warnings": traps(scan, None)}
     points, level, rounded = as_cleaned(points, seed, threads, unround=unround)
-    places = points[distinct(points)[0]]
+    places = points[first]
     places = places[spatial_order(places)]
     probes = places[np.sort(np.random.default_rng(seed).choice(len(places), min(noise_level.N_PROBES, len(places)), False))]
     k = min(N_NEIGHBOURS, len(places))
@@ -113,8 +113,7 @@ def as_cleaned(
 
     config = DenoiseConfig.model_validate({"seed": seed, "threads": threads if threads > 0 else None, "unround": unround})
     shift, rounded = unrounding(points, config)
-    level = level_of(points, store.load(), config, shift, rounded)
-    return points + shift, level, {} if rounded is None else rounded.figures
+    return points + shift, level_of(points, store.load(), config, shift), {} if rounded is None else rounded.figures
 
 
 def cost(n_points: int, n_passes: float = 1, n_draws: int = 1) -> dict[str, float]:

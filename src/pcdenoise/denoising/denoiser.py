@@ -94,8 +94,6 @@ def denoise(
     if config.outliers != "keep" and len(cloud.start) >= FEWEST_POINTS:
         found = cloud.to_rows(outliers.find(cloud.aligned, level=cloud.level.as_read, threads=cloud.threads), False)
     steps = list(_passes(cloud, model, config, on_progress or (lambda _task, _share: None)))
-    if not steps:
-        cloud.reached = cloud.aligned
     moved = steps[-1].points if steps else limited(cloud.start, cloud.aligned, config)
     unmoved = cloud.unmoved(moved)
     length = cloud.to_rows(np.linalg.norm(moved - cloud.start, axis=1), np.nan)[cloud.finite] if len(moved) else np.zeros(1)
@@ -128,15 +126,9 @@ def denoise(
     return Result(placed[-1].points if placed else cloud.placed(moved), found, unmoved, figures, placed, std)
 
 
-def level_of(
-    points: Points,
-    model: Model | None,
-    config: DenoiseConfig,
-    shift: Points | None = None,
-    rounded: Rounding | None = None,
-) -> NoiseLevel:
+def level_of(points: Points, model: Model | None, config: DenoiseConfig, shift: Points | None = None) -> NoiseLevel:
     """The noise level by which `denoise` would clean (N, 3) points."""
-    return _Cloud(points, model, config, None, shift, rounded).level
+    return _Cloud(points, model, config, shift=shift).level
 
 
 def alignment_of(points: Points, groupings: list[Groups], model: Model | None, config: DenoiseConfig) -> list[Alignment]:
@@ -168,9 +160,10 @@ def unrounding(points: Points, config: DenoiseConfig) -> tuple[Points, Rounding 
     check_extent(usable)
     threads = config.threads or os.cpu_count() or 1
     found = rounding.find(usable, threads) if config.unround else None
-    if found is not None:
-        moved[finite] = rounding.shift(usable, found, threads)
-    return moved, found if moved[finite].any() else None
+    if found is None:
+        return moved, None
+    moved[finite] = rounding.shift(usable, found, threads)
+    return moved, found if moved.any() else None
 
 
 def shift_of(points: Points, group: Groups, model: Model | None, config: DenoiseConfig) -> tuple[Points, dict[str, float]]:
@@ -191,7 +184,7 @@ def iterate(
 ) -> Iterator[Step]:
     """Pass after pass, each fed with the last one's output: (N, 3) points and figures of every step. shift, rounded as of
     `denoise`."""
-    cloud = _Cloud(points, model, config, None, shift, rounded)
+    cloud = _Cloud(points, model, config, shift=shift, rounded=rounded)
     for step in _passes(cloud, model, config, lambda _task, _share: None, is_judged=True):
         yield Step(cloud.placed(step.points), step.figures)
 

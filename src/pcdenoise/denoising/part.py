@@ -45,8 +45,8 @@ def denoise_part(
     else:
         worked &= False
     rows = np.flatnonzero(worked)
-    moved = None if shift is None else shift[rows]
-    result = denoise(points[rows], model, config, on_progress, level=level, shift=moved, rounded=rounded)
+    before = None if shift is None else shift[rows]
+    result = denoise(points[rows], model, config, on_progress, level=level, shift=before, rounded=rounded)
 
     chosen = movable[rows]
     moved, outlier, left_alone = points.copy(), np.zeros(len(points), np.bool_), np.ones(len(points), np.bool_)

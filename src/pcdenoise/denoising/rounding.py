@@ -127,7 +127,7 @@ def shift(points: Points, rounding: Rounding, threads: int = -1) -> Points:
     return moved[place]
 
 
-def _between(step: Floats, image: Points, threads: int) -> Floats:
+def _between(steps: Floats, image: Points, threads: int) -> Floats:
     """(N,) depths s in steps, of points whose depths were rounded to these (N,) steps k, seen at (N, 3) places of an image.
 
     They minimise ½ Σ 0.9 (L s)² + 0.1 s·L s + 0.1 d², |s - k| ≤ 1: a plate that hardly bends, L being the Laplacian of
@@ -138,12 +138,12 @@ def _between(step: Floats, image: Points, threads: int) -> Floats:
     """
     from scipy import sparse
 
-    n, k = len(step), min(_NEIGHBOURS, len(step) - 1)
+    n, k = len(steps), min(_NEIGHBOURS, len(steps) - 1)
     other = knn(image, k + 1, threads=threads)[1][:, 1:]
-    is_linked = np.abs(step[other] - step[:, None]) < _MOST_STEPS_APART + 0.5
+    is_linked = np.abs(steps[other] - steps[:, None]) < _MOST_STEPS_APART + 0.5
     is_free = is_linked.all(axis=1)
     if is_free.mean() < _ONE_SURFACE:
-        return step
+        return steps
     own = np.repeat(np.arange(n), k)[is_linked.ravel()]
     links = sparse.csr_matrix((np.ones(len(own)), (own, other[is_linked])), shape=(n, n))
     links = links.maximum(links.T)
@@ -152,13 +152,13 @@ def _between(step: Floats, image: Points, threads: int) -> Floats:
     stiffest = 2 * float(degree.max())  # no eigenvalue of L is larger
     rate = 1 / (_BENDING * stiffest**2 + (1 - _BENDING) * stiffest + _PULL)
     furthest = np.where(is_free, _FURTHEST_STEPS, 0.0)
-    now = ahead = step
+    now = ahead = steps
     momentum = 1.0
     for _ in range(_TURNS):
         bent = laplacian @ ahead
         force = _BENDING * (laplacian @ bent) + (1 - _BENDING) * bent
-        force += _PULL * (ahead - np.clip(ahead, step - 0.5, step + 0.5))
-        after = np.clip(ahead - rate * force, step - furthest, step + furthest)
+        force += _PULL * (ahead - np.clip(ahead, steps - 0.5, steps + 0.5))
+        after = np.clip(ahead - rate * force, steps - furthest, steps + furthest)
         grown = (1 + np.sqrt(1 + 4 * momentum**2)) / 2
         change = after - now
         ahead, now, momentum = after + (momentum - 1) / grown * change, after, grown
