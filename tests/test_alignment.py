@@ -14,7 +14,7 @@ from pcdenoise.cloud.scan import Scan
 from pcdenoise.commands import main
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising.alignment import groups_of
-from pcdenoise.denoising.denoiser import alignment_of, denoise, shift_of
+from pcdenoise.denoising.denoiser import alignment_of, correction_of, denoise
 from pcdenoise.errors import ScanError, UsageError
 from pcdenoise.learning import trainer
 from pcdenoise.learning.structure import shared_by
@@ -57,9 +57,9 @@ def test_a_plane_tells_offsets_along_its_normal_alone() -> None:
 def test_aligned_groups_are_cleaned_as_if_they_had_not_been_off(name: str) -> None:
     sample, points, group, _ = off_by_group(name, 2.0)
     plain, clean = (sample.error(denoise(noisy, store.load(), CONFIG).points) for noisy in (points, sample.noisy))
-    shift, figures = shift_of(points, group, store.load(), CONFIG)
-    assert figures["groups"] == N_GROUPS
-    aligned = sample.error(denoise(points, store.load(), CONFIG, shift=shift).points)
+    correction = correction_of(points, group, store.load(), CONFIG)
+    assert correction.figures["groups"] == N_GROUPS
+    aligned = sample.error(denoise(points, store.load(), CONFIG, correction=correction).points)
     assert clean < 0.9 * plain
     assert aligned < clean + 0.25 * (plain - clean)
 
@@ -84,8 +84,8 @@ def test_groups_without_neighbours_of_other_groups_stay() -> None:
 def test_the_order_of_rows_and_the_numbers_of_groups_do_not_matter() -> None:
     sample, points, group, _ = off_by_group("sphere", 2.0)
     order = np.random.default_rng(5).permutation(N)
-    there = shift_of(points, group, store.load(), CONFIG)[0]
-    back = shift_of(points[order], (N_GROUPS - 1 - group)[order], store.load(), CONFIG)[0]
+    there = correction_of(points, group, store.load(), CONFIG).shift
+    back = correction_of(points[order], (N_GROUPS - 1 - group)[order], store.load(), CONFIG).shift
     assert np.abs(there[order] - back).max() < 1e-6 * sample.spacing
 
 
@@ -93,20 +93,20 @@ def test_a_group_may_be_of_rows_that_coincide_with_others_or_are_not_finite() ->
     sample, points, group, _ = off_by_group("sphere", 2.0)
     more = np.concatenate([points, points[:5], np.full((2, 3), np.nan)])
     groups = np.concatenate([group, np.repeat([N_GROUPS, N_GROUPS + 1], [5, 2])])
-    shift, figures = shift_of(more, groups, store.load(), CONFIG)
-    assert figures["groups"] == N_GROUPS + 2
-    assert np.abs(shift[:N] - shift_of(points, group, store.load(), CONFIG)[0]).max() < 1e-9 * sample.spacing
-    cleaned = denoise(more, store.load(), CONFIG, shift=shift).points
+    correction = correction_of(more, groups, store.load(), CONFIG)
+    assert correction.figures["groups"] == N_GROUPS + 2
+    assert np.abs(correction.shift[:N] - correction_of(points, group, store.load(), CONFIG).shift).max() < 1e-9 * sample.spacing
+    cleaned = denoise(more, store.load(), CONFIG, correction=correction).points
     assert np.array_equal(cleaned[N : N + 5], cleaned[:5])
 
 
 def test_limits_count_from_where_points_were_measured() -> None:
     sample, points, group, _ = off_by_group("sphere", 2.0)
-    shift = shift_of(points, group, store.load(), CONFIG)[0]
+    correction = correction_of(points, group, store.load(), CONFIG)
     limit = 0.3 * NOISE_SPACINGS * sample.spacing
-    near = denoise(points, store.load(), CONFIG.model_copy(update={"max_move": limit}), shift=shift)
+    near = denoise(points, store.load(), CONFIG.model_copy(update={"max_move": limit}), correction=correction)
     assert 0.99 * limit < np.linalg.norm(near.points - points, axis=1).max() < limit * (1 + 1e-9)
-    still = denoise(points, store.load(), CONFIG.model_copy(update={"strength": 0.0}), shift=shift)
+    still = denoise(points, store.load(), CONFIG.model_copy(update={"strength": 0.0}), correction=correction)
     assert np.array_equal(still.points, points)
 
 

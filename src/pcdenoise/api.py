@@ -44,13 +44,9 @@ def denoise(
     if not isinstance(points, Scan) and chosen.align_by:
         raise UsageError("align_by: names columns, which an array has not; give a Scan")
     groups = groups_asked_for(points, loaded, chosen) if isinstance(points, Scan) else None
-    shift, rounded = denoiser.unrounding(rows, chosen)
-    figures = {} if rounded is None else rounded.figures
-    if groups is not None:
-        offsets, about = denoiser.shift_of(rows + shift, groups, loaded, chosen)
-        shift, figures = shift + offsets, figures | about
-    result = denoiser.denoise(rows, loaded, chosen, on_progress, shift=shift, rounded=rounded)
-    return replace(result, figures={**result.figures, **figures})
+    correction = denoiser.correction_of(rows, groups, loaded, chosen)
+    result = denoiser.denoise(rows, loaded, chosen, on_progress, correction=correction)
+    return replace(result, figures={**result.figures, **correction.figures})
 
 
 def _configured(settings: dict[str, Any]) -> DenoiseConfig:

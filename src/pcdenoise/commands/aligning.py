@@ -1,13 +1,13 @@
-"""What is shifted before a scan is cleaned, and what is said of that: rounded depths, and by `--align-by` groups of its points.
+"""What is taken back before a scan is cleaned, and what is said of that: rounding of depths, offsets of groups.
 
 Not here: how far (denoising/rounding.py, denoising/alignment.py).
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
-from pcdenoise.commands.batch import Figures
 from pcdenoise.commands.console import Console, counted, figure
 from pcdenoise.commands.options import option
 from pcdenoise.errors import UsageError
@@ -15,8 +15,8 @@ from pcdenoise.errors import UsageError
 if TYPE_CHECKING:
     from pcdenoise.cloud.scan import Mask, Points, Scan
     from pcdenoise.config import DenoiseConfig
+    from pcdenoise.denoising.correction import Correction
     from pcdenoise.denoising.denoiser import Progress
-    from pcdenoise.denoising.rounding import Rounding
     from pcdenoise.networks.store import Model
 
 AlignBy = Annotated[
@@ -47,10 +47,10 @@ def columns(text: str | None) -> tuple[str, ...] | None:
     return names
 
 
-def shift(
+def correction(
     scan: Scan, seen: Mask, model: Model | None, config: DenoiseConfig, console: Console, on_progress: Progress
-) -> tuple[Points, Rounding | None, Figures]:
-    """(N, 3) by how much rows are moved before they are cleaned, how depths were rounded, and figures of both.
+) -> Correction:
+    """What is taken back of the rows before they are cleaned; in its figures aligned_by as well.
 
     seen (N,): rows that have a say; the others stay. Raises ScanError for columns that the settings name and the scan has not.
     """
@@ -60,21 +60,19 @@ def shift(
     from pcdenoise.denoising.alignment import columns_asked_for, groups_asked_for
 
     groups = groups_asked_for(scan, model, config, lambda fault: console.note(f"{fault}; cleaned as it is"))
-    moved, points = np.zeros((len(scan), 3)), scan.points[seen]
-    moved[seen], rounded = denoiser.unrounding(points, config)
-    figures = {} if rounded is None else rounded.figures
+    if groups is not None:
+        on_progress("aligning", 0.0)
+    found = denoiser.correction_of(scan.points[seen], None if groups is None else groups[seen], model, config).to_rows(seen)
     if groups is None:
-        return moved, rounded, figures
-    on_progress("aligning", 0.0)
-    offsets, names = np.zeros((len(scan), 3)), columns_asked_for(model, config)
-    offsets[seen], found = denoiser.shift_of(points + moved[seen], groups[seen], model, config)
+        return found
+    names = columns_asked_for(model, config)
     rows, sizes = np.unique(groups, return_index=True, return_counts=True)[1:]
     for row, n in zip(rows[:_MOST_GROUPS], sizes, strict=False):
         values = ", ".join(f"{name} {scan.attributes[name][row]}" for name in names)
-        console.detail(f"{values}: {counted(int(n), 'point')} shifted by {', '.join(map(figure, offsets[row]))}")
+        console.detail(f"{values}: {counted(int(n), 'point')} shifted by {', '.join(map(figure, found.offset[row]))}")
     if len(rows) > _MOST_GROUPS:
         console.detail(f"and {len(rows) - _MOST_GROUPS:,} more groups")
-    return moved + offsets, rounded, {**figures, "aligned_by": ",".join(names), **found}
+    return replace(found, figures=found.figures | {"aligned_by": ",".join(names)})
 
 
 def note_unshifted(source: str, some: Points, model: Model | None, config: DenoiseConfig, console: Console) -> None:

@@ -244,15 +244,13 @@ class Cleaning:
         self._refuse(job, scan)
         with self.console.progress(job.source.name) as on_progress:
             movable, seen = self.selection.masks(scan)
-            shift, rounded, before = aligning.shift(scan, seen, self.model, self.config, self.console, on_progress)
+            correction = aligning.correction(scan, seen, self.model, self.config, self.console, on_progress)
             if self.selection == selection.Selection():
-                result = denoiser.denoise(scan.points, self.model, self.config, on_progress, shift=shift, rounded=rounded)
+                result = denoiser.denoise(scan.points, self.model, self.config, on_progress, correction=correction)
             else:
                 if not movable.any():
                     self.console.note(f"{job.source}: no point is asked for by {self.selection}; written as it is")
-                result = denoise_part(
-                    scan.points, movable, seen, self.model, self.config, on_progress, shift=shift, rounded=rounded
-                )
+                result = denoise_part(scan.points, movable, seen, self.model, self.config, on_progress, correction=correction)
         for step in result.steps:
             self.console.detail(", ".join(f"{name.replace('_', ' ')} {figure(value)}" for name, value in step.figures.items()))
         check_drift(job.target, result.figures["drift"], result.figures["noise"], self.max_drift)
@@ -261,7 +259,12 @@ class Cleaning:
             self._written(scan, result), job.target, format=format_of(job.target, self.format), overwrite=self.overwrite,
             drop_attributes=self.drop_attributes, provenance=outputs.provenance("denoise", self.settings),
         )  # fmt: skip
-        figures = {"points": len(scan), **result.figures, **before, "seconds": round(time.perf_counter() - started, 3)}
+        figures = {
+            "points": len(scan),
+            **result.figures,
+            **correction.figures,
+            "seconds": round(time.perf_counter() - started, 3),
+        }
         if self.config.outliers == "remove":
             figures["points_written"] = len(scan) - figures["outliers"]
         unit = unit_of(scan)

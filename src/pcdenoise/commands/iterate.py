@@ -76,8 +76,8 @@ def iterate(
     passes = [_Pass(scan.points, truth.errors(scan.points))]
     console = Console(quiet)
     with console.progress(source.name) as on_progress:
-        shift, rounded, before = aligning.shift(scan, np.ones(len(scan), bool), weights, settings, console, on_progress)
-        steps = denoiser.iterate(scan.points, weights, settings, shift=shift, rounded=rounded)
+        correction = aligning.correction(scan, np.ones(len(scan), bool), weights, settings, console, on_progress)
+        steps = denoiser.iterate(scan.points, weights, settings, correction=correction)
         for number, step in enumerate(steps, start=1):
             on_progress(f"pass {number}", 0.0 if settings.iters == "auto" else number / settings.iters)
             output.mkdir(parents=True, exist_ok=True)
@@ -90,7 +90,7 @@ def iterate(
     output.mkdir(parents=True, exist_ok=True)  # a scan without a surface has no pass
     print(_as_text(passes))
     _save_strip(strip, scan, passes, overwrite)
-    _save_report(report, scan, passes, {**named, **before}, overwrite)
+    _save_report(report, scan, passes, {**named, **correction.figures}, overwrite)
     console.note(f"{output}: {counted(len(passes) - 1, 'pass', 'passes')}, {strip.name}, {report.name}")
 
 

@@ -108,12 +108,13 @@ def as_cleaned(
 ) -> tuple[Points, NoiseLevel, dict[str, Any]]:
     """(N, 3) finite points as the default model would be given them, their noise, and figures of depths that were rounded."""
     from pcdenoise.config import DenoiseConfig
-    from pcdenoise.denoising.denoiser import level_of, unrounding
+    from pcdenoise.denoising.correction import unrounded
+    from pcdenoise.denoising.denoiser import level_of
     from pcdenoise.networks import store
 
     config = DenoiseConfig.model_validate({"seed": seed, "threads": threads if threads > 0 else None, "unround": unround})
-    shift, rounded = unrounding(points, config)
-    return points + shift, level_of(points, store.load(), config, shift), {} if rounded is None else rounded.figures
+    correction = unrounded(points, config)
+    return points + correction.shift, level_of(points, store.load(), config, correction), correction.figures
 
 
 def cost(n_points: int, n_passes: float = 1, n_draws: int = 1) -> dict[str, float]:

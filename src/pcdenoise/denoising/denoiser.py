@@ -5,9 +5,8 @@ Not here: files (commands), what a network does in a pass (network_pass.py), fil
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -15,22 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdenoise.cloud import drift
-from pcdenoise.cloud.neighbours import Identity, coordinate_hash, distinct_by, drawn_by, nearest_to, spatial_order
-from pcdenoise.cloud.noise_level import NoiseLevel, by_place, estimate_at, probes
-from pcdenoise.cloud.scan import Mask, Points, check_extent, within
+from pcdenoise.cloud.neighbours import Identity, spatial_order
+from pcdenoise.cloud.noise_level import NoiseLevel, by_place, estimate_at
+from pcdenoise.cloud.scan import Mask, Points, within
 from pcdenoise.config import DenoiseConfig
-from pcdenoise.denoising import classical, network_pass, outliers, rounding, taken_off, uncertainty
+from pcdenoise.denoising import classical, network_pass, outliers, taken_off, uncertainty
 from pcdenoise.denoising.alignment import Alignment, Groups, align, heights
+from pcdenoise.denoising.correction import Correction, unrounded
+from pcdenoise.denoising.local_cloud import LocalCloud
 from pcdenoise.denoising.relaxation import relax, without_low_frequencies
 from pcdenoise.denoising.risk import Risk
-from pcdenoise.denoising.rounding import Rounding
 from pcdenoise.errors import UsageError
 from pcdenoise.networks.store import Model, ProjectionSettings
 
 FEWEST_POINTS = 16
 """Smaller clouds come back as they were: no surface can be told from them."""
-N_CENTRAL = 1 << 16
-"""Points whose median becomes the local frame's origin."""
 _MOST_PASSES = 10
 _SHRINKING = 0.035
 """Radius over which moves that all points share are taken back, in the network's units of length; as released."""
@@ -79,22 +77,20 @@ def denoise(
     on_progress: Progress | None = None,
     *,
     level: NoiseLevel | None = None,
-    shift: Points | None = None,
-    rounded: Rounding | None = None,
+    correction: Correction | None = None,
 ) -> Result:
     """Moves (N, 3) float64 points onto the surface they were measured on; row i stays row i.
 
-    level: the noise, if it is known. shift (N, 3): by how much rows are moved before that, see `unrounding` and `shift_of`.
-    rounded: what was undone by that, so that something of it is left.
+    level: the noise, if it is known. correction: what is taken back of the rows before the passes, see `correction_of`.
     Rows that are not finite stay as they are; exact duplicates move together; the network leaves a cloud in which no scale
     shows a surface as it is. Raises UsageError when the network is asked for without a model.
     """
-    cloud = _Cloud(points, model, config, level, shift, rounded)
+    cloud = LocalCloud(points, model, config, level, correction)
     found = np.zeros(len(points), dtype=bool)
     if config.outliers != "keep" and len(cloud.start) >= FEWEST_POINTS:
-        found = cloud.to_rows(outliers.find(cloud.aligned, level=cloud.level.as_read, threads=cloud.threads), False)
+        found = cloud.to_rows(outliers.find(cloud.corrected, level=cloud.level.as_read, threads=cloud.threads), False)
     steps = list(_passes(cloud, model, config, on_progress or (lambda _task, _share: None)))
-    moved = steps[-1].points if steps else limited(cloud.start, cloud.aligned, config)
+    moved = steps[-1].points if steps else limited(cloud.start, cloud.corrected, config)
     unmoved = cloud.unmoved(moved)
     length = cloud.to_rows(np.linalg.norm(moved - cloud.start, axis=1), np.nan)[cloud.finite] if len(moved) else np.zeros(1)
     drifted = drift.measure(cloud.start, moved, config.seed, cloud.threads)
@@ -118,7 +114,7 @@ def denoise(
     if config.uncertainty:
         off = np.full(len(moved), np.nan)
         if cloud.level.is_surface:
-            noise = by_place(cloud.aligned, cloud.identity, cloud.level.as_read, cloud.threads)
+            noise = by_place(cloud.corrected, cloud.identity, cloud.level.as_read, cloud.threads)
             cleaned = cloud.reached[spatial_order(cloud.reached)]
             off = uncertainty.estimate(cleaned, cloud.start, cloud.reached, moved, noise, cloud.threads)
         std = cloud.to_rows(off, np.nan)
@@ -126,9 +122,9 @@ def denoise(
     return Result(placed[-1].points if placed else cloud.placed(moved), found, unmoved, figures, placed, std)
 
 
-def level_of(points: Points, model: Model | None, config: DenoiseConfig, shift: Points | None = None) -> NoiseLevel:
+def level_of(points: Points, model: Model | None, config: DenoiseConfig, correction: Correction | None = None) -> NoiseLevel:
     """The noise level by which `denoise` would clean (N, 3) points."""
-    return _Cloud(points, model, config, shift=shift).level
+    return LocalCloud(points, model, config, correction=correction).level
 
 
 def alignment_of(points: Points, groupings: list[Groups], model: Model | None, config: DenoiseConfig) -> list[Alignment]:
@@ -139,7 +135,7 @@ def alignment_of(points: Points, groupings: list[Groups], model: Model | None, c
     unmoved = [Alignment.none(groups) for groups in groupings]
     if all(len(alignment) < 2 for alignment in unmoved):
         return unmoved
-    cloud = _Cloud(points, model, config)
+    cloud = LocalCloud(points, model, config)
     if not most_passes(len(cloud.start), cloud.level, config):
         return unmoved
     plain = config.model_copy(update={"relax_steps": 0})
@@ -152,26 +148,13 @@ def alignment_of(points: Points, groupings: list[Groups], model: Model | None, c
     return [align(cloud.start, cloud.of_rows(groups), none, first, cleaned, cloud.threads) for groups, none in pairs]
 
 
-def unrounding(points: Points, config: DenoiseConfig) -> tuple[Points, Rounding | None]:
-    """(N, 3) by how much each row is moved so that depths that a camera rounded lie between their steps; and how they were
-    rounded, None where nothing was, or is to stay so, and nothing moves."""
-    finite = np.logical_and.reduce(np.isfinite(points), axis=1)
-    usable, moved = points[finite], np.zeros_like(points)
-    check_extent(usable)
-    threads = config.threads or os.cpu_count() or 1
-    found = rounding.find(usable, threads) if config.unround else None
-    if found is None:
-        return moved, None
-    moved[finite] = rounding.shift(usable, found, threads)
-    return moved, found if moved.any() else None
-
-
-def shift_of(points: Points, group: Groups, model: Model | None, config: DenoiseConfig) -> tuple[Points, dict[str, float]]:
-    """(N, 3) by how much each row is moved so that its group meets the others, and figures: groups, offset (root mean square)."""
-    alignment = alignment_of(points, [group], model, config)[0]
-    shift = alignment.shift[group]
-    offset = float(np.sqrt((shift**2).sum(axis=1).mean())) if len(shift) else 0.0
-    return shift, {"groups": len(alignment), "offset": offset}
+def correction_of(points: Points, group: Groups | None, model: Model | None, config: DenoiseConfig) -> Correction:
+    """What is taken back of (N, 3) points before the passes: rounding, then by how much groups (N,), if any, are off."""
+    found = unrounded(points, config)
+    if group is None:
+        return found
+    alignment = alignment_of(points + found.shift, [group], model, config)[0]
+    return found.then(alignment, group)
 
 
 def iterate(
@@ -179,89 +162,12 @@ def iterate(
     model: Model | None,
     config: DenoiseConfig,
     *,
-    shift: Points | None = None,
-    rounded: Rounding | None = None,
+    correction: Correction | None = None,
 ) -> Iterator[Step]:
-    """Pass after pass, each fed with the last one's output: (N, 3) points and figures of every step. shift, rounded as of
-    `denoise`."""
-    cloud = _Cloud(points, model, config, shift=shift, rounded=rounded)
+    """Pass after pass, each fed with the last one's output: (N, 3) points and figures of each. correction: as in `denoise`."""
+    cloud = LocalCloud(points, model, config, correction=correction)
     for step in _passes(cloud, model, config, lambda _task, _share: None, is_judged=True):
         yield Step(cloud.placed(step.points), step.figures)
-
-
-class _Cloud:
-    """The distinct finite points of an input in spatial order around their own origin, and the way back to its rows.
-
-    start, aligned, reached (D, 3): as measured; once each group is shifted; where the passes so far led them from there.
-    """
-
-    def __init__(
-        self,
-        points: Points,
-        model: Model | None,
-        config: DenoiseConfig,
-        level: NoiseLevel | None = None,
-        shift: Points | None = None,
-        rounded: Rounding | None = None,
-    ) -> None:
-        self.config, self.rows = config, points
-        self.threads = config.threads or os.cpu_count() or 1
-        self.finite: Mask = np.logical_and.reduce(np.isfinite(points), axis=1)
-        usable = points[self.finite]
-        check_extent(usable)
-        identity = coordinate_hash(usable, 0)
-        first, place = distinct_by(identity)
-        self.origin = origin_of(usable[first[:N_CENTRAL]])  # `distinct_by` sorts by the hash, so these are drawn by it
-        distinct = usable[first] - self.origin
-        order = spatial_order(distinct)
-        back = np.empty_like(order)
-        back[order] = np.arange(len(order))
-        self._first, self._row = np.flatnonzero(self.finite)[first[order]], back[place]
-        self.start: Points = distinct[order]
-        self.aligned: Points = self.start if shift is None else self.start + self.of_rows(shift)
-        self.reached = self.aligned
-        self.identity: Identity = identity[first][order]
-        self.probes = probes(drawn_by(self.identity, config.seed))
-        level = level or self._level(model)
-        left = None if rounded is None else lambda points: rounded.left(points + self.origin)
-        self.level: NoiseLevel = replace(level, least=left)
-        self.diagonal = float(np.linalg.norm(np.ptp(self.start, axis=0))) if len(self.start) else 0.0
-
-    def _level(self, model: Model | None) -> NoiseLevel:
-        """The noise as neighbours disagree by it, then, where a network cleans, as a pass takes it off some of the points."""
-        model = model if self.config.method == "network" else None
-        read = estimate_at(self.aligned, self.probes, self.threads, self.config.noise)
-        first = np.argsort(drawn_by(self.identity[self.probes], self.config.seed))[: taken_off.N_SAMPLES]
-        centres = self.aligned[self.probes[first]]
-        return taken_off.level_by(read, centres, self._around, model, self.config.seed, self.threads)
-
-    def _around(self, centre: Points, most: int) -> taken_off.Sample:
-        rows = nearest_to(centre, self.aligned, self.identity, most)
-        return self.aligned[rows], self.identity[rows]
-
-    def of_rows(self, values: NDArray[Any]) -> NDArray[Any]:
-        """(D, …) values of the distinct points, from those of all rows (N, …)."""
-        return values[self._first]
-
-    def to_rows(self, values: NDArray[Any], missing: Any) -> NDArray[Any]:
-        """Values of the distinct points (D, …) spread to all rows (N, …); positions get their origin back."""
-        rows = np.full((len(self.finite), *values.shape[1:]), missing, dtype=values.dtype)
-        rows[self.finite] = values[self._row] + self.origin if values.ndim == 2 else values[self._row]
-        return rows
-
-    def unmoved(self, moved: Points) -> Mask:
-        """(N,) input rows that stay where they are."""
-        still: Mask = np.logical_and.reduce(moved == self.start, axis=1)
-        return self.to_rows(still, True)
-
-    def placed(self, moved: Points) -> Points:
-        """(N, 3) input rows at their new places; those that stay keep every bit, which the way over the origin may cost."""
-        return np.where(self.unmoved(moved)[:, None], self.rows, self.to_rows(moved, np.nan))
-
-
-def origin_of(points: Points) -> Points:
-    """(3,) whole numbers in the middle of (N, 3) points, those of the N_CENTRAL smallest hashes: the local frame's origin."""
-    return np.round(np.median(points, axis=0)) if len(points) else np.zeros(3)
 
 
 def limited(start: Points, moved: Points, config: DenoiseConfig) -> Points:
@@ -311,13 +217,13 @@ class Judge:
 
 
 def _passes(
-    cloud: _Cloud, model: Model | None, config: DenoiseConfig, on_progress: Progress, is_judged: bool = False
+    cloud: LocalCloud, model: Model | None, config: DenoiseConfig, on_progress: Progress, is_judged: bool = False
 ) -> Iterator[Step]:
     """Every pass goes on from where the last one led, not from what strength and limit leave of it.
 
     `is_judged`: the error before and after each pass is estimated, as `auto` does anyway, at the cost of another pass.
     """
-    points, level, judge = cloud.aligned, cloud.level, None
+    points, level, judge = cloud.corrected, cloud.level, None
     n_passes = most_passes(len(points), level, config)
     if n_passes and (config.iters == "auto" or is_judged):
         risk = Risk(points, cloud.identity, level.as_read, config.seed, cloud.threads)

@@ -8,8 +8,8 @@ import numpy as np
 
 from pcdenoise.cloud.scan import Mask, Points
 from pcdenoise.config import DenoiseConfig
+from pcdenoise.denoising.correction import Correction
 from pcdenoise.denoising.denoiser import Progress, Result, denoise, level_of
-from pcdenoise.denoising.rounding import Rounding
 from pcdenoise.networks.store import Model
 
 _REACH_SPACINGS = 64.0
@@ -24,8 +24,7 @@ def denoise_part(
     config: DenoiseConfig,
     on_progress: Progress | None = None,
     *,
-    shift: Points | None = None,
-    rounded: Rounding | None = None,
+    correction: Correction | None = None,
 ) -> Result:
     """`denoise`, but only `movable` rows (N,) move, and only `seen` rows (N,) have a say; every other row keeps each bit.
 
@@ -35,7 +34,7 @@ def denoise_part(
     """
     usable = np.logical_and.reduce(np.isfinite(points), axis=1)
     movable = movable & seen
-    level = level_of(points[seen], model, config, None if shift is None else shift[seen])
+    level = level_of(points[seen], model, config, None if correction is None else correction.of_rows(seen))
     worked = seen & usable
     if (movable & usable).any():
         passes = 10 if config.iters == "auto" else config.iters
@@ -45,8 +44,8 @@ def denoise_part(
     else:
         worked &= False
     rows = np.flatnonzero(worked)
-    before = None if shift is None else shift[rows]
-    result = denoise(points[rows], model, config, on_progress, level=level, shift=before, rounded=rounded)
+    before = None if correction is None else correction.of_rows(rows)
+    result = denoise(points[rows], model, config, on_progress, level=level, correction=before)
 
     chosen = movable[rows]
     moved, outlier, left_alone = points.copy(), np.zeros(len(points), np.bool_), np.ones(len(points), np.bool_)

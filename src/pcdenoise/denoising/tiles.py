@@ -47,6 +47,7 @@ from pcdenoise.denoising import classical, denoiser, outliers, risk, taken_off, 
 from pcdenoise.denoising.cells import Cells, Part, n_own
 from pcdenoise.denoising.cuts import by_cell, cell_of, cuts_of, number_of_cells
 from pcdenoise.denoising.denoiser import Progress
+from pcdenoise.denoising.local_cloud import N_CENTRAL, origin_of
 from pcdenoise.denoising.seeds import share_of_seeds
 from pcdenoise.networks.store import Model
 from pcdenoise.whole_files import replaced
@@ -136,7 +137,7 @@ class Tiles:
             return old
         shutil.rmtree(self.folder, ignore_errors=True)
         (self.folder / "start").mkdir(parents=True)
-        central, probed = _Smallest(denoiser.N_CENTRAL), _Smallest(N_PROBES)
+        central, probed = _Smallest(N_CENTRAL), _Smallest(N_PROBES)
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         n_rows = n_finite = 0
         for chunk in self.chunks():
@@ -148,7 +149,7 @@ class Tiles:
             low, high = np.minimum(low, usable.min(axis=0, initial=np.inf)), np.maximum(high, usable.max(axis=0, initial=-np.inf))
         if n_finite:
             check_extent(np.stack([low, high]))
-        origin = denoiser.origin_of(central.points)
+        origin = origin_of(central.points)
         cuts = cuts_of(central.points - origin, max(1, -(-n_finite // self.cell_points)))
         plan: dict[str, Any] = {
             "job": self.job,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pcdenoise import io
 from pcdenoise.cloud.neighbours import distinct
 from pcdenoise.config import DenoiseConfig
-from pcdenoise.denoising.denoiser import unrounding
+from pcdenoise.denoising.correction import unrounded
 from pcdenoise.errors import ScanError, UsageError
 from pcdenoise.learning.dataset import N_DENSE, PROCEDURAL, Array, Surface, is_learned_from, measured
 from pcdenoise.learning.scans import DATASET, files_of
@@ -107,7 +107,7 @@ def _parts_of_scans(path: Path, seed: int, folder: Path) -> list[Path]:
         points = points[distinct(points)[0]]
         if len(points) < _FEWEST_POINTS:
             continue
-        points = points + unrounding(points, DenoiseConfig.model_validate({}))[0]
+        points = points + unrounded(points, DenoiseConfig.model_validate({})).shift
         rng = np.random.default_rng([seed, 5, len(parts)])
         n_parts = 1 if len(points) <= _PART_POINTS else min(_MOST_PARTS, 2 * len(points) // _PART_POINTS)
         learned = is_learned_from(points)
