@@ -223,3 +223,140 @@ XYZ = {
     "big integers": b"1.5 2.5 3.5 9007199254740993\n4.5 5.5 6.5 1\n7.5 8.5 9.5 2\n",
 }
 """Text scans of three rows in many dialects."""
+
+
+def _crc32c(data: bytes) -> int:
+    """Bit by bit, as its definition goes."""
+    crc = 0xFFFFFFFF
+    for octet in data:
+        crc ^= octet
+        for _ in range(8):
+            crc = crc >> 1 ^ 0x82F63B78 * (crc & 1)
+    return crc ^ 0xFFFFFFFF
+
+
+def e57_pages(logical: bytes, page: int = 1024) -> bytes:
+    """The pages of an E57 file with their checksums."""
+    room = page - 4
+    parts = [logical[at : at + room].ljust(room, b"\0") for at in range(0, len(logical), room)]
+    return b"".join(part + struct.pack(">I", _crc32c(part)) for part in parts)
+
+
+def e57_logical(raw: bytes, page: int = 1024) -> bytes:
+    """The bytes of an E57 file without checksums."""
+    return b"".join(raw[at : at + page - 4] for at in range(0, len(raw), page))
+
+
+def e57(kind: str = "single", *, n: int = 300, n_stations: int = 1, image: bytes = b"", groups: bool = False) -> bytes:
+    """An E57 file with intensities of odd bit lengths, a constant field, one of another namespace, text and several packets.
+
+    `kind` is 'single', 'double', 'scaled' (19 bits, offset), 'integer', 'spherical' (and Cartesian ones), or 'invalid', where
+    every seventh record says that it is no measurement. From the second station on they are posed.
+    """
+    page = 1024
+    data = bytearray(48)
+
+    def physical(at: int) -> int:
+        return at // (page - 4) * page + at % (page - 4)
+
+    def bits(values: Sequence[int], size: int) -> bytes:
+        return sum(value << size * i for i, value in enumerate(values)).to_bytes(-(-len(values) * size // 8), "little")
+
+    def section(streams: Sequence[bytes], n_packets: int) -> int:
+        data.extend(bytes(-len(data) % 4))
+        start = len(data)
+        first = physical(start + 64)
+        packets = bytearray(struct.pack("<BBHHB9xQQ", 0, 0, 31, 1, 0, 0, first))  # the index comes first
+        for number in range(n_packets):
+            cuts = [(len(some) * number // n_packets, len(some) * (number + 1) // n_packets) for some in streams]
+            parts = [some[slice(*cut)] for some, cut in zip(streams, cuts, strict=True)]
+            body = struct.pack(f"<{len(parts)}H", *map(len, parts)) + b"".join(parts)
+            body += bytes(-(6 + len(body)) % 4)
+            packets += struct.pack("<BBHH", 1, 0, 5 + len(body), len(parts)) + body
+        packets += struct.pack("<BBH", 2, 0, 7) + bytes(4)
+        data.extend(struct.pack("<B7xQQQ", 1, 32 + len(packets), first, physical(start + 32)) + packets)
+        return physical(start)
+
+    rng = np.random.default_rng(4)
+    stations = []
+    for number in range(n_stations):
+        local = rng.normal(0, 4, (n, 3))
+        axes = [f"cartesian{axis}" for axis in "XYZ"]
+        fields: list[tuple[str, bytes]] = []
+        if kind in ("scaled", "integer"):
+            scale, offset = (0.0005, 100.0) if kind == "scaled" else (1.0, 0.0)
+            local = 1000 * local if kind == "integer" else local
+            steps = np.rint((local - offset) / scale).astype(int)
+            low = int(steps.min())
+            high = low + (1 << 19) - 1
+            said = f'type="ScaledInteger" minimum="{low}" maximum="{high}" scale="{scale}" offset="{offset}"'
+            said = said if kind == "scaled" else f'type="Integer" minimum="{low}" maximum="{high}"'
+            for axis, values in zip(axes, steps.T, strict=True):
+                fields.append((f"<{axis} {said}>{low}</{axis}>", bits([int(value) - low for value in values], 19)))
+        else:
+            precision, code = ("double", "<f8") if kind == "double" else ("single", "<f4")
+            for axis, values in zip(axes, local.T, strict=True):
+                low, high = float(values.min()), float(values.max())
+                ends = f'minimum="{low!r}" maximum="{high!r}"' if kind == "double" else ""
+                fields.append((f'<{axis} type="Float" precision="{precision}" {ends}/>', values.astype(code).tobytes()))
+        if kind == "spherical":
+            flat = np.hypot(local[:, 0], local[:, 1])
+            angles = np.hypot(flat, local[:, 2]), np.arctan2(local[:, 1], local[:, 0]), np.arctan2(local[:, 2], flat)
+            names = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+            fields = [
+                (f'<{name} type="Float"/>', values.astype("<f8").tobytes()) for name, values in zip(names, angles, strict=True)
+            ]
+        if kind == "invalid":
+            state = [2 * (i % 7 == 0) for i in range(n)]
+            fields.append(('<cartesianInvalidState type="Integer" minimum="0" maximum="2"/>', bits(state, 2)))
+        fields += [
+            ('<intensity type="Integer" minimum="-3" maximum="1000"/>', bits(rng.integers(0, 1004, n).tolist(), 10)),
+            ('<returnCount type="Integer" minimum="1" maximum="1">1</returnCount>', b""),
+            ('<who:wide type="Integer"/>', rng.integers(-(2**62), 2**62, n).astype("<i8").tobytes()),
+            (f'<who:long type="Integer" minimum="0" maximum="{2**60 - 1}"/>', bits(rng.integers(0, 2**60, n).tolist(), 60)),
+        ]  # fmt: skip
+        turn = "".join(
+            f"<{name} type='Float'>{value}</{name}>" for name, value in (("w", "8e-1"), ("x", ""), ("y", ""), ("z", "6e-1"))
+        )
+        shift = "<translation type='Structure'><x type='Float'>1e2</x><y type='Float'/></translation>"
+        pose = f"<pose type='Structure'><rotation type='Structure'>{turn}</rotation>{shift}</pose>"
+        at = section([stream for _, stream in fields], 3)
+        grouped = ""
+        if groups:
+            rows = section([bits([0, n // 2], 16), bits([n // 2, n - n // 2], 16)], 1)
+            grouped = (
+                '<pointGroupingSchemes type="Structure"><groupingByLine type="Structure">'
+                f'<groups type="CompressedVector" fileOffset="{rows}" recordCount="2"><prototype type="Structure">'
+                '<startPointIndex type="Integer" minimum="0" maximum="65535"/>'
+                '<pointCount type="Integer" minimum="0" maximum="65535"/>'
+                "</prototype><codecs type='Vector' allowHeterogeneousChildren='1'/></groups>"
+                "</groupingByLine></pointGroupingSchemes>"
+            )
+        stations.append(
+            f'  <vectorChild type="Structure"><guid type="String"><![CDATA[{{station {number}}}]]></guid>'
+            f"<temperature type='Float'>2e1</temperature> <!-- a > b -->{pose if number else ''}"
+            '<cartesianBounds type="Structure"><xMinimum type="Float">-1e-1</xMinimum><xMaximum type="Float"/></cartesianBounds>'
+            f'{grouped}<points type="CompressedVector" recordCount="{n}" fileOffset = "{at}">'
+            f'<prototype type="Structure">{"".join(said for said, _ in fields)}</prototype>'
+            '<codecs type="Vector" allowHeterogeneousChildren="1"/></points></vectorChild>\n'
+        )
+    pictures = ""
+    if image:
+        data.extend(bytes(-len(data) % 4))
+        pictures = (
+            '<images2D type="Vector" allowHeterogeneousChildren="1"><vectorChild type="Structure">'
+            '<visualReferenceRepresentation type="Structure">'
+            f'<jpegImage type="Blob" fileOffset="{physical(len(data))}" length="{len(image)}"/>'
+            "</visualReferenceRepresentation></vectorChild></images2D>"
+        )
+        data.extend(struct.pack("<B7xQ", 0, 16 + len(image)) + image)
+    xml = (
+        '<?xml version="1.0" encoding="UTF-8"?>\n<e57Root type="Structure" xmlns="http://www.astm.org/COMMIT/E57/2010-e57-v1.0"'
+        " xmlns:who='urn:who'>\n<formatName type='String'><![CDATA[ASTM E57 3D Imaging Data File]]></formatName>"
+        "<guid type='String'>{file}</guid><versionMajor type='Integer'>1</versionMajor><versionMinor type='Integer'/>"
+        f'<data3D type="Vector" allowHeterogeneousChildren="1">\n{"".join(stations)}</data3D>{pictures}</e57Root>'
+    ).encode()
+    data.extend(bytes(-len(data) % 4))
+    length = -(-(len(data) + len(xml)) // (page - 4)) * page
+    head = struct.pack("<8sIIQQQQ", b"ASTM-E57", 1, 0, length, physical(len(data)), len(xml), page)
+    return e57_pages(head + bytes(data[48:]) + xml, page)

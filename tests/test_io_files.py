@@ -26,6 +26,7 @@ SAMPLES = {
     "scan.pcd": io_samples.pcd("binary_compressed"),
     "scan.XYZ": io_samples.XYZ["columns"],
     "scan.csv": io_samples.XYZ["semicolons"],
+    "scan.e57": io_samples.e57("double", n=60),
     "scan.bin": np.random.default_rng(0).normal(size=(50, 4)).astype("<f4").tobytes(),
 }
 EVERY_SAMPLE = pytest.mark.parametrize("name", SAMPLES)
@@ -72,7 +73,7 @@ def test_select_wants_one_mark_a_row_and_works_without_a_file() -> None:
         io.select(scan, np.ones(2, np.bool_))
 
 
-PAIRS = list(itertools.product(SAMPLES, (".las", ".laz", ".ply", ".pcd", ".xyz", ".csv", ".pts", ".bin")))
+PAIRS = list(itertools.product(SAMPLES, (".las", ".laz", ".ply", ".pcd", ".xyz", ".csv", ".pts", ".bin", ".e57")))
 
 
 @pytest.mark.parametrize(("name", "suffix"), PAIRS)
@@ -157,8 +158,8 @@ def test_utf16_is_told_apart_from_noise_and_a_misfit_names_the_target(tmp_path: 
 def test_a_format_can_be_named_and_must_be_known(folder: Path) -> None:
     (folder / "noname").write_bytes(SAMPLES["scan.pcd"])
     assert io.read(folder / "noname", format="pcd").format == "pcd"
-    with pytest.raises(ScanError, match="format e57 is unknown"):
-        io.read(folder / "noname", format="e57")
+    with pytest.raises(ScanError, match="format e58 is unknown"):
+        io.read(folder / "noname", format="e58")
 
 
 def test_a_missing_file_and_a_folder_are_named(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ class Scan:
 
     points      (N, 3) float64, file units; rows may be NaN or infinite (organised clouds): see `finite`.
     attributes  name -> (N,) array in the file's own dtype, everything per point except x, y, z.
-    format      'las', 'laz', 'ply', 'xyz' or 'pcd'.
+    format      'las', 'laz', 'ply', 'xyz', 'pcd', 'bin' or 'e57'.
     origin      where it was read from, for messages.
     source      what the format's own module needs to write the file back as it was; opaque to everyone else.
     added       names of attributes that were not in the file (displacement, outlier flag, …).
@@ -68,7 +68,7 @@ class Scan:
         return replace(self, points=np.ascontiguousarray(points, dtype=np.float64))
 
     def with_attributes(self, **values: NDArray[Any]) -> Scan:
-        """The scan with new per-point columns, written as LAS extra bytes, PLY properties, text columns or PCD fields."""
+        """The scan with new per-point columns, written as LAS extra bytes, PLY properties, text columns, PCD or E57 fields."""
         added = self.added + tuple(name for name in values if name not in self.added)
         return replace(self, attributes={**self.attributes, **values}, added=added)
 

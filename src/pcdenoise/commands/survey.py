@@ -182,6 +182,8 @@ def unit_of(scan: Scan) -> str:
     """The unit of a scan's coordinates, or nothing where its file names none or one that cannot be right."""
     from pcdenoise import io
 
+    if scan.format == "e57":
+        return "m"  # as its standard says
     system = io.coordinate_system(scan)
     return "" if system is None or _misfit(system, scan.points[scan.finite]) else system.unit
 

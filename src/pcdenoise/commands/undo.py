@@ -48,7 +48,7 @@ def undo(
     """Take a cleaned scan back to the original, exactly; needs a scan written by denoise --displacement.
 
     The columns that it added and the note on how it was made go too: a LAS, binary PLY or binary PCD is the original byte for
-    byte. Compressed files hold the same and may be packed otherwise; a number in a text may gain zeros at its end.
+    byte. Compressed files and E57 hold the same and may be packed otherwise; a number in a text may gain zeros at its end.
 
     Example: pcdenoise undo clean.laz -o original.laz
     """

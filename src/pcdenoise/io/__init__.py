@@ -1,4 +1,4 @@
-"""Reading and writing scans: one suffix table, one call each way. Not here: any format's details (las, ply, xyz, pcd, kitti).
+"""Reading and writing scans: one suffix table, one call each way. Not here: any format's details (las, ply, xyz, …).
 
 What was read is written back as it was but for the coordinates that moved: `Scan.source` keeps the file, taken apart.
 """
@@ -17,17 +17,17 @@ import numpy as np
 
 from pcdenoise.cloud.scan import Mask, Scan
 from pcdenoise.errors import ScanError
-from pcdenoise.io import files, kitti, las, pcd, ply, text, xyz
+from pcdenoise.io import e57, files, kitti, las, pcd, ply, text, xyz
 from pcdenoise.io.crs import Crs
 from pcdenoise.io.source import changed, portable
 
 SUFFIXES = {
-    ".las": "las", ".laz": "laz", ".ply": "ply", ".pcd": "pcd", ".bin": "bin",
+    ".las": "las", ".laz": "laz", ".ply": "ply", ".pcd": "pcd", ".bin": "bin", ".e57": "e57",
     ".xyz": "xyz", ".txt": "xyz", ".csv": "xyz", ".asc": "xyz", ".pts": "xyz",
 }  # fmt: skip
 """File suffix -> format."""
 
-_MODULES: dict[str, ModuleType] = {"las": las, "laz": las, "ply": ply, "pcd": pcd, "bin": kitti, "xyz": xyz}
+_MODULES: dict[str, ModuleType] = {"las": las, "laz": las, "ply": ply, "pcd": pcd, "bin": kitti, "e57": e57, "xyz": xyz}
 _HEAD = 4096
 
 
@@ -69,7 +69,8 @@ def write(
 ) -> None:
     """Write a scan to a file, whole or not at all, or to stdout if the path is '-' (`format` is needed then).
 
-    provenance  JSON-ready facts on how the scan was made, kept in a LAS VLR, a PLY or PCD comment; the rest have no place for it.
+    provenance  JSON-ready facts on how the scan was made, kept in a LAS VLR, a PLY or PCD comment,
+                the XML of an E57; the rest have no place for it.
     Raises ScanError if the target exists (unless `overwrite`), cannot be written, or its format would drop something `losses`
     names (unless `drop_attributes`).
     """
@@ -111,7 +112,7 @@ class Stream(Protocol):
 
 @contextmanager
 def streamed(path: str | os.PathLike[str], *, format: str | None = None) -> Iterator[Stream | None]:
-    """A file as a stream, or None where it has to be read whole: stdin, PCD, KITTI, PLY as text or with lists.
+    """A file as a stream, or None where it has to be read whole: stdin, PCD, KITTI, E57, PLY as text or with lists.
 
     Raises ScanError as `read` does, for what shows without reading the points.
     """
@@ -185,7 +186,9 @@ def coordinate_system(scan: Scan) -> Crs | None:
 
 
 def coordinate_step(scan: Scan) -> float | None:
-    """What the file rounds moved coordinates to: the scale of a LAS, else None: text gets the decimals that it needs."""
+    """What the file rounds moved coordinates to: the scale of LAS or E57, else None: text gets the decimals that it needs."""
+    if isinstance(scan.source, e57.E57Source):
+        return scan.source.step() if scan.source.has_steps else None
     return float(np.abs(scan.source.file.field("scale")).max()) if isinstance(scan.source, las.LasSource) else None
 
 
@@ -198,7 +201,9 @@ def rounding(scan: Scan) -> float:
     step = coordinate_step(scan)
     if step is None:
         step = 4 * float(np.spacing(largest))
-        if scan.format == "xyz":
+        if isinstance(scan.source, e57.E57Source):  # rounded in a station's own frame
+            step = max(step, scan.source.step())
+        elif scan.format == "xyz":
             decimals = text.fewest_decimals(points.ravel())
             coarsest = text.COORDINATE_STEP * float(np.ptp(points, axis=0).max())
             step = max(step, coarsest if decimals is None else min(coarsest, 10.0**-decimals))
@@ -236,6 +241,8 @@ def _encode(scan: Scan, file: BinaryIO, format: str, suffix: str, provenance: Ma
             pcd.write(scan, file, provenance=provenance)
         case "bin":
             kitti.write(scan, file)
+        case "e57":
+            e57.write(scan, file, provenance=provenance)
         case _:
             xyz.write(scan, file, suffix=suffix)
 
@@ -258,4 +265,5 @@ def _sniffed(head: bytes) -> str:
     """The format that the first bytes show; nothing if none."""
     if las.matches(head):
         return "laz" if las.is_compressed(head) else "las"
-    return "ply" if ply.matches(head) else "pcd" if pcd.matches(head) else "xyz" if xyz.matches(head) else ""
+    kinds: dict[str, Any] = {"ply": ply, "pcd": pcd, "e57": e57, "xyz": xyz}
+    return next((name for name, module in kinds.items() if module.matches(head)), "")

@@ -1,0 +1,317 @@
+"""E57 scans (ASTM E2807), as terrestrial scanners write them: stations with poses, images, and points packed bit by bit.
+
+All stations of a file are one scan in world coordinates; with several of them a column says of which one a point is. What is
+written back has every station, image and field it had. Not here: stations (e57_stations.py), the container (e57_file.py),
+elements of its XML (e57_xml.py).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcdenoise.cloud.scan import Mask, Points, Scan
+from pcdenoise.errors import ScanError
+from pcdenoise.io import e57_file
+from pcdenoise.io.e57_file import Container, Field, Layout
+from pcdenoise.io.e57_new import NAMES, NAMESPACES, OURS, PROVENANCE, added, created, described, storable
+from pcdenoise.io.e57_stations import BOUNDS, CARTESIAN, SPHERICAL, Records, Station, offset, prototype, stations_of
+from pcdenoise.io.e57_xml import Edits, Element, a_text, parsed
+from pcdenoise.io.source import (
+    Column,
+    changed,
+    free_name,
+    moved_rows,
+)
+
+STATION = "station"
+"""The column that says of which station a point is, where a file has several."""
+
+
+@dataclass(frozen=True)
+class E57Source:
+    """An E57 file: its bytes, their container, the root of its XML and its stations; labels: the field of each attribute."""
+
+    raw: bytes
+    container: Container
+    root: Element
+    stations: Sequence[Station]
+    labels: Mapping[str, str]
+    columns: Mapping[str, Column]
+    origin: str
+
+    @property
+    def xml(self) -> bytes:
+        """The text of its XML."""
+        return self.container.data[self.container.xml].tobytes()
+
+    def points(self) -> Points:
+        """(N, 3) world coordinates; NaN where a record says that it is no measurement."""
+        return np.concatenate([station.world() for station in self.stations] or [np.zeros((0, 3))])
+
+    def step(self) -> float:
+        """The length that moved coordinates are rounded to where they are coarsest; 0 where all are float64."""
+        return max((station.step() for station in self.stations), default=0.0)
+
+    @property
+    def has_steps(self) -> bool:
+        """Whether coordinates are whole numbers of steps, not floats."""
+        return any(field.kind in ("integer", "scaled") for station in self.stations for field in station.coordinates)
+
+    def attachments(self) -> list[str]:
+        """Images, poses and metadata of the coordinates."""
+        return list(self.payloads())
+
+    def payloads(self) -> dict[str, bytes]:
+        """The bytes of all images; poses and metadata as the XML says them."""
+        blobs = [element for element in self.root.all() if element.attributes.get("type") == "Blob"]
+        places = [json.dumps([station.rotation.tolist(), station.translation.tolist()]) for station in self.stations]
+        metadata = self.root.find("coordinateMetadata")
+        found = {
+            "images": b"".join(e57_file.blob_at(self.container, offset(blob, self.origin), self.origin) for blob in blobs),
+            "poses of stations": "\n".join(places).encode() if any(station.is_placed for station in self.stations) else b"",
+            "coordinate metadata": b"" if metadata is None else metadata.text.strip().encode(),
+        }
+        return {name: data for name, data in found.items() if data}
+
+    def without(self, names: Collection[str]) -> E57Source:
+        """The file without these fields and our provenance; its other points are packed anew."""
+        gone, edits, parts = {self.labels[name] for name in names if name in self.labels}, Edits(self.xml), []
+        for station in self.stations:
+            part = _Part.of(station)
+            for number in reversed(range(len(part.fields))):
+                if part.fields[number].name in gone:
+                    del part.fields[number], part.streams[number]
+            for child in prototype(station.records.element).children:
+                if child.name in gone:
+                    edits.remove(child)
+            parts.append(part)
+        if (provenance := self.root.find(PROVENANCE)) is not None:
+            edits.remove(provenance)
+        source: E57Source = read(_assembled(self, parts, edits), self.origin).source
+        return source
+
+    def selected(self, keep: Mask) -> E57Source:
+        """The file with only these points; what groups rows of a station is left out. Raises ScanError for text per point."""
+        edits, parts = Edits(self.xml), []
+        for station in self.stations:
+            part, kept = _Part.of(station), keep[station.rows]
+            for number, field in enumerate(part.fields):
+                if field.kind == "text":
+                    raise ScanError(f"{self.origin}: has text for each point ({field.name}), which rows cannot be taken out of")
+                part.streams[number] = field.packed(field.unpacked(part.streams[number], part.n)[kept])
+            part.n = int(kept.sum())
+            parts.append(part)
+            if (groups := station.element.find("pointGroupingSchemes")) is not None:
+                edits.remove(groups)
+        source: E57Source = read(_assembled(self, parts, edits, are_grouped=False), self.origin).source
+        return source
+
+
+@dataclass
+class _Part:
+    """The records of a station as they are to be written; ends: lowest and highest of the floats that are new, by their field."""
+
+    fields: list[Field]
+    streams: list[bytes]
+    n: int
+    ends: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+
+    @classmethod
+    def of(cls, station: Station) -> _Part:
+        """As they are in the file."""
+        records = station.records
+        return cls(list(records.fields), records.streams, records.n)
+
+    def put(self, number: int, values: Column) -> None:
+        """Gives a field (n,) other values, and wider bounds where they need them."""
+        field = self.fields[number]
+        if field.kind in ("integer", "scaled") and len(values):
+            field = replace(field, low=min(field.low, int(values.min())), high=max(field.high, int(values.max())))
+        elif len(known := values[np.isfinite(values)]):
+            self.ends[field.name] = float(known.min()), float(known.max())
+        self.fields[number], self.streams[number] = field, field.packed(values)
+
+
+def matches(head: bytes) -> bool:
+    """Whether a file starts like E57."""
+    return head.startswith(e57_file.SIGNATURE)
+
+
+def read(raw: bytes, origin: str) -> Scan:
+    """A scan of E57 bytes: all stations in world coordinates, their fields as attributes. Raises ScanError on damage.
+
+    A field that a station lacks is 0 there, or NaN. Records that say that they are no measurement have coordinates of NaN.
+    """
+    container = e57_file.opened(raw, origin)
+    root = parsed(container.data[container.xml].tobytes(), origin)
+    stations = list(stations_of(container, root, origin))
+    if sum(station.records.size for station in stations) > len(raw):
+        raise ScanError(f"{origin}: several stations claim the same points; it is damaged, fetch it again")
+    source = E57Source(raw, container, root, stations, {}, {}, origin)
+    own = {*CARTESIAN, *SPHERICAL}
+    names = dict.fromkeys(f.name for s in stations for f in s.records.fields if f.name not in own and f.kind != "text")
+    labels: dict[str, str] = {}
+    columns: dict[str, Column] = {}
+    for name in names:
+        attribute = free_name(NAMES.get(name, name.removeprefix(OURS)), columns)
+        labels[attribute], columns[attribute] = name, _column(stations, name)
+    if len(stations) > 1:
+        kind = np.min_scalar_type(len(stations) - 1)
+        numbers = np.repeat(np.arange(len(stations), dtype=kind), [station.records.n for station in stations])
+        columns[free_name(STATION, columns)] = numbers
+    source = replace(source, labels=labels, columns=columns)
+    return Scan(source.points(), columns, "e57", origin, source)
+
+
+def unstorable(columns: Mapping[str, Column]) -> list[str]:
+    """The names of columns that E57 has no number type for: text, and uint64."""
+    return [name for name in columns if name not in storable(columns)]
+
+
+def write(scan: Scan, file: BinaryIO, *, provenance: Mapping[str, Any] | None = None) -> None:
+    """Write a scan as E57: the file it came from with moved coordinates and new fields, or a new one with one station.
+
+    Coordinates keep the number type that they have; integers get wider bounds where moved points need them.
+    """
+    if not isinstance(scan.source, E57Source):
+        file.write(created(scan, provenance))
+        return
+    source, columns = scan.source, changed(scan)
+    if any(name in source.columns and name not in source.labels for name in columns):
+        raise ScanError("of which station a point is cannot be changed; write .las or .ply instead")
+    before, edits, parts = source.points(), Edits(source.xml), []
+    moved = np.logical_or.reduce([moved_rows(before[:, i], scan.points[:, i]) for i in range(3)])
+    new = storable({name: values for name, values in columns.items() if name not in source.labels})
+    for station in source.stations:
+        part, rows = _Part.of(station), station.rows
+        if moved[rows].any():
+            _move(station, part, edits, scan.points[rows], moved[rows])
+        for name, values in columns.items():
+            number = station.records.number(source.labels.get(name, ""))
+            if number is not None:
+                part.put(number, _as_stored(part.fields[number], values[rows]))
+        further = added({name: values[rows] for name, values in new.items()}, [field.name for field in part.fields])
+        for field, stream in further:
+            part.fields.append(field)
+            part.streams.append(stream)
+            edits.append(prototype(station.records.element), described(field))
+        _widen(station, part, edits)
+        parts.append(part)
+    if provenance is not None:
+        if (earlier := source.root.find(PROVENANCE)) is not None:
+            edits.remove(earlier)
+        edits.append(source.root, a_text(PROVENANCE, json.dumps(provenance)))
+    if new or provenance is not None:
+        used = {field.name.partition(":")[0] for part in parts for field in part.fields} | {"pcdenoise"}
+        edits.set(source.root, **{f"xmlns:{short}": name for short, name in NAMESPACES.items() if short in used})
+    file.write(_assembled(source, parts, edits))
+
+
+def _column(stations: Sequence[Station], name: str) -> Column:
+    """(N,) values of a field in all stations; 0 or NaN in those that have none."""
+    parts = [station.records.measured(name) for station in stations]
+    dtype = np.result_type(*(part.dtype for part in parts if part is not None))
+    missing = np.nan if dtype.kind == "f" else 0
+    pairs = zip(stations, parts, strict=True)
+    whole = [np.full(station.records.n, missing, dtype) if part is None else part.astype(dtype) for station, part in pairs]
+    return np.concatenate(whole)
+
+
+def _as_stored(field: Field, values: Column) -> Column:
+    """(n,) values as a field stores them: the nearest that it has. Raises ScanError where an integer is no number."""
+    if field.kind in ("single", "double"):
+        return values.astype(np.float32 if field.kind == "single" else np.float64)
+    steps = np.rint((values - field.offset) / field.scale) if field.kind == "scaled" else np.rint(values)
+    if not np.isfinite(steps).all() or (np.abs(steps) > 2.0**62).any():
+        raise ScanError(f"{field.name} holds whole numbers, which the new values are not; write .las or .ply instead")
+    return steps.astype(np.int64)
+
+
+def _move(station: Station, part: _Part, edits: Edits, points: Points, moved: Mask) -> None:
+    """Puts moved (n, 3) points of a station into all coordinates that it has, and their bounds into its XML."""
+    for system in station.systems:
+        new = station.from_world(points[moved], system)
+        for axis, name in enumerate(system):
+            number, values = station.records.number(name), station.records.values(name)
+            assert number is not None
+            assert values is not None
+            stored = _as_stored(part.fields[number], new[:, axis])
+            values = values.astype(stored.dtype)
+            values[moved] = stored
+            part.put(number, values)
+        bounds = station.element.find("cartesianBounds") if system == CARTESIAN else None
+        ends = np.stack([new.min(axis=0), new.max(axis=0)], axis=1).reshape(-1)
+        for name, end in zip(BOUNDS, ends, strict=True):
+            element = bounds.find(name) if bounds is not None else None
+            before = element.number() if element is not None else end
+            if element is not None and (end > before if name.endswith("Maximum") else end < before):
+                edits.put(element, float(end))
+
+
+def _widen(station: Station, part: _Part, edits: Edits) -> None:
+    """Says in the XML between what bounds the fields that were there lie now."""
+    for child, before, field in zip(
+        prototype(station.records.element).children, station.records.fields, part.fields, strict=False
+    ):
+        low, high = part.ends.get(field.name, (np.inf, -np.inf))
+        if (field.low, field.high) != (before.low, before.high):
+            edits.set(child, minimum=str(field.low), maximum=str(field.high))
+        elif low < float(child.attributes.get("minimum", "-inf")) or high > float(child.attributes.get("maximum", "inf")):
+            edits.set(child, minimum=repr(low), maximum=repr(high))
+
+
+def _assembled(source: E57Source, parts: Sequence[_Part], edits: Edits, are_grouped: bool = True) -> bytes:
+    """The file with its stations' records replaced: in place where they are as long as they were, else section by section."""
+    container, data = source.container, source.container.data
+    pairs = list(zip(source.stations, parts, strict=True))
+    if all(_fits(station, part) for station, part in pairs):
+        data = data.copy()
+        for station, part in pairs:
+            for pieces, stream in zip(station.records.vector.pieces, part.streams, strict=True):
+                _put(data, pieces, stream)
+        if edits.made() == source.xml and (data == container.data).all():
+            return source.raw
+        end = container.xml.start if not data[container.xml.stop :].any() else len(data)
+        return e57_file.closed(data[:end].tobytes(), edits.made(), container.page)
+    layout = Layout()
+    by_element = {id(station.records.element): part for station, part in pairs}
+    gone = [] if are_grouped else [s.element.find("pointGroupingSchemes") for s in source.stations]
+    skipped = {id(inner) for element in gone if element is not None for inner in element.all()}
+    for element in source.root.all():
+        kind = element.attributes.get("type")
+        if kind not in ("Blob", "CompressedVector") or id(element) in skipped:
+            continue
+        if kind == "Blob":
+            at = layout.add_blob(e57_file.blob_at(container, offset(element, source.origin), source.origin))
+            edits.set(element, fileOffset=str(at))
+        elif id(element) in by_element:
+            new = by_element[id(element)]
+            at = layout.add_vector(new.fields, new.streams, new.n)
+            edits.set(element, fileOffset=str(at), recordCount=str(new.n))
+        else:
+            records = Records.at(element, container, source.origin)
+            edits.set(element, fileOffset=str(layout.add_vector(records.fields, records.streams, records.n)))
+    return e57_file.closed(layout.data, edits.made())
+
+
+def _fits(station: Station, part: _Part) -> bool:
+    """Whether a station's records can be put where they were."""
+    records = station.records
+    same = part.n == records.n and len(part.fields) == len(records.fields)
+    return same and all(new.bits == old.bits for new, old in zip(part.fields, records.fields, strict=True))
+
+
+def _put(data: NDArray[np.uint8], pieces: Sequence[slice], stream: bytes) -> None:
+    """Puts a stream where it was; the file may have had some bytes behind its last value."""
+    at = 0
+    for piece in pieces:
+        part = np.frombuffer(stream[at : at + piece.stop - piece.start], np.uint8)
+        data[piece.start : piece.start + len(part)] = part
+        at += len(part)

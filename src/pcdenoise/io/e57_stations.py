@@ -1,0 +1,220 @@
+"""The stations of an E57 file: what fields their points have, how they are posed, and where points are in the world.
+
+Not here: the container (e57_file.py), a scan of all stations and how it is written (e57.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcdenoise.cloud.scan import Points
+from pcdenoise.errors import ScanError
+from pcdenoise.io import e57_file
+from pcdenoise.io.e57_file import Container, Field, Vector
+from pcdenoise.io.e57_xml import Element
+from pcdenoise.io.source import Column
+
+CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
+SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+INVALID: dict[tuple[str, ...], str] = {CARTESIAN: "cartesianInvalidState", SPHERICAL: "sphericalInvalidState"}
+"""The fields that say whether a record is a measurement: 0 if it is."""
+
+BOUNDS = [axis + end for axis in "xyz" for end in ("Minimum", "Maximum")]
+"""What a station says of the box that its Cartesian coordinates lie in."""
+
+_TYPES = {"Float": "double", "Integer": "integer", "ScaledInteger": "scaled", "String": "text"}
+_LEAST, _MOST = -(2**63), 2**63 - 1
+_MOST_FIELDS = 256
+
+
+@dataclass(frozen=True)
+class Records:
+    """n records: the element that names them, their fields, and where in the container their streams are."""
+
+    element: Element
+    fields: Sequence[Field]
+    n: int
+    container: Container
+    vector: Vector
+
+    @classmethod
+    def at(cls, element: Element, container: Container, origin: str) -> Records:
+        """The records that an element names. Raises ScanError on damage, and where there are fewer than it claims."""
+        try:
+            fields = [_field(child) for child in prototype(element).children]
+            n = int(element.attributes["recordCount"])
+        except (KeyError, ValueError) as fault:
+            raise ScanError(f"{origin}: its XML tells no fields of its points ({fault}); it is damaged, fetch it again") from None
+        if n < 0 or len(fields) > _MOST_FIELDS or len({field.name for field in fields}) < len(fields):
+            raise ScanError(f"{origin}: its XML claims {n} points of {len(fields)} fields; it is damaged, fetch it again")
+        vector = e57_file.vector_at(container, offset(element, origin), len(fields), origin)
+        sizes = [sum(piece.stop - piece.start for piece in some) for some in vector.pieces]
+        if any(size < e57_file.bytes_of(field, n) for field, size in zip(fields, sizes, strict=True)) or n > 8 * sum(sizes):
+            raise ScanError(f"{origin}: claims {n} points and holds fewer; it is cut off or damaged, fetch it again")
+        return cls(element, fields, n, container, vector)
+
+    @property
+    def size(self) -> int:
+        """Bytes of all streams."""
+        return sum(piece.stop - piece.start for some in self.vector.pieces for piece in some)
+
+    @property
+    def streams(self) -> list[bytes]:
+        """The stream of each field."""
+        return [self.vector.stream(self.container, number) for number in range(len(self.fields))]
+
+    def number(self, name: str) -> int | None:
+        """The number of the field of that name."""
+        return next((i for i, field in enumerate(self.fields) if field.name == name), None)
+
+    def values(self, name: str) -> Column | None:
+        """(n,) values of a field as stored, None where there is no such field."""
+        number = self.number(name)
+        if number is None:
+            return None
+        return self.fields[number].unpacked(self.vector.stream(self.container, number), self.n)
+
+    def measured(self, name: str) -> Column | None:
+        """(n,) values of a field in its unit: scaled integers are float64 then."""
+        values, number = self.values(name), self.number(name)
+        if values is None or number is None or self.fields[number].kind != "scaled":
+            return values
+        return values * self.fields[number].scale + self.fields[number].offset
+
+
+@dataclass(frozen=True)
+class Station:
+    """One setup of a scanner: its records, rows of them in the scan, and its pose: world = rotation · local + translation."""
+
+    element: Element
+    records: Records
+    rows: slice
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+
+    @property
+    def systems(self) -> list[tuple[str, ...]]:
+        """The coordinates that it has, Cartesian ones first."""
+        names = {field.name for field in self.records.fields}
+        return [system for system in (CARTESIAN, SPHERICAL) if names.issuperset(system)]
+
+    @property
+    def is_placed(self) -> bool:
+        """Whether world and local coordinates differ."""
+        return bool((self.rotation != np.eye(3)).any() or self.translation.any())
+
+    @property
+    def coordinates(self) -> list[Field]:
+        """The three fields that say where its points are."""
+        return [field for name in self.systems[0] for field in self.records.fields if field.name == name]
+
+    def local(self) -> Points:
+        """(n, 3) points in the scanner's own frame."""
+        system = self.systems[0]
+        values = np.stack([np.asarray(self.records.measured(name), np.float64) for name in system], axis=1)
+        if system == CARTESIAN:
+            return values
+        distance, azimuth, elevation = values.T
+        flat = distance * np.cos(elevation)
+        return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)], axis=1)
+
+    def world(self) -> Points:
+        """(n, 3) points in the world; NaN where a record says that it is no measurement."""
+        points = self.local()
+        if self.is_placed:
+            points = points @ self.rotation.T + self.translation
+        state = self.records.values(INVALID[self.systems[0]])
+        if state is not None:
+            points[state != 0] = np.nan
+        return points
+
+    def from_world(self, points: Points, system: tuple[str, ...]) -> Points:
+        """(m, 3) points of the world in the coordinates of one of the station's systems."""
+        local = (points - self.translation) @ self.rotation if self.is_placed else points
+        if system == CARTESIAN:
+            return local
+        flat = np.hypot(local[:, 0], local[:, 1])
+        azimuth, elevation = np.arctan2(local[:, 1], local[:, 0]), np.arctan2(local[:, 2], flat)
+        return np.stack([np.hypot(flat, local[:, 2]), azimuth, elevation], axis=1)
+
+    def step(self) -> float:
+        """The length that coordinates are rounded to where they are coarsest; 0 where they are float64."""
+        local = self.local()
+        reach = float(np.linalg.norm(local[np.isfinite(local).all(axis=1)], axis=1).max(initial=0.0))
+        steps = []
+        for field in self.coordinates:
+            is_angle = field.name in SPHERICAL[1:]
+            floats = {"single": float(np.spacing(np.float32(np.pi if is_angle else reach))), "double": 0.0}
+            steps.append(floats.get(field.kind, field.scale) * (reach if is_angle else 1.0))
+        return max(steps)
+
+
+def stations_of(container: Container, root: Element, origin: str) -> Iterator[Station]:
+    """The stations that have points, in order. Raises ScanError on damage, and where points have no coordinates."""
+    data, at = root.find("data3D"), 0
+    for element in data.children if data is not None else []:
+        points = element.find("points")
+        if points is None:
+            continue
+        records = Records.at(points, container, origin)
+        try:
+            station = Station(element, records, slice(at, at + records.n), *_pose(element.find("pose")))
+            _ = [element.number("cartesianBounds", name) for name in BOUNDS]
+        except ValueError:
+            raise ScanError(f"{origin}: poses or bounds are no numbers; it is damaged, fetch it again") from None
+        if not station.systems or any(field.kind == "text" for field in station.coordinates):
+            names = ", ".join(field.name for field in records.fields)
+            raise ScanError(f"{origin}: points have no coordinates (but {names}); save them as Cartesian ones")
+        yield station
+        at += records.n
+
+
+def prototype(points: Element) -> Element:
+    """The element that names the fields of records. Raises KeyError without one."""
+    found = points.find("prototype")
+    if found is None:
+        raise KeyError("prototype")
+    return found
+
+
+def offset(element: Element, origin: str) -> int:
+    """Where in the file the section is that an element names. Raises ScanError where it says none."""
+    try:
+        return int(element.attributes["fileOffset"])
+    except (KeyError, ValueError):
+        raise ScanError(f"{origin}: its XML says not where {element.name} is; it is damaged, fetch it again") from None
+
+
+def _field(element: Element) -> Field:
+    """Raises KeyError and ValueError for what is no field."""
+    said, kind = element.attributes, _TYPES[element.attributes["type"]]
+    if kind == "double":
+        _ = float(said.get("minimum", 0)), float(said.get("maximum", 0))  # numbers, if anything
+        return Field(element.name, "single" if said.get("precision") == "single" else "double")
+    if kind == "text":
+        return Field(element.name, "text")
+    low, high = int(said.get("minimum", _LEAST)), int(said.get("maximum", _MOST))
+    if not _LEAST <= low <= high <= _MOST:
+        raise ValueError(f"{element.name} between {low} and {high}")
+    scale, start = float(said.get("scale", 1)), float(said.get("offset", 0))
+    if not (np.isfinite([scale, start]).all() and scale > 0):
+        raise ValueError(f"{element.name} in steps of {scale} from {start}")
+    return Field(element.name, "scaled" if kind == "scaled" else "integer", low, high, scale, start)
+
+
+def _pose(element: Element | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotation (3, 3) and translation (3,). Raises ValueError for what is no number."""
+    if element is None:
+        return np.eye(3), np.zeros(3)
+    translation = np.array([element.number("translation", axis) for axis in "xyz"])
+    w, *v = (element.number("rotation", axis, default=float(axis == "w")) for axis in "wxyz")
+    length = float(np.sqrt(w * w + np.dot(v, v)))
+    if not (length > 0 and np.isfinite(length) and np.isfinite(translation).all()):
+        raise ValueError("no rotation")
+    w, (x, y, z) = w / length, np.array(v) / length
+    across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + 2 * w * across + 2 * across @ across, translation
