@@ -73,7 +73,7 @@ def moves(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 @cache
 def model(kind: str) -> Model:
     """'untrained': the zero head, a classical filter; 'seeded': a random head, so that every weight of the network counts;
-    'mcconv': the paper's network with random weights."""
+    'wide': the same with messages of 48 channels; 'mcconv': the paper's network with random weights."""
     import torch
 
     from pcdenoise.networks.mcconv import PAPER, MCConvNetwork
@@ -83,7 +83,7 @@ def model(kind: str) -> Model:
         torch.manual_seed(11)
         if kind == "mcconv":
             return Model.of(MCConvNetwork(PAPER), kind)
-        network = ProjectionNetwork(ProjectionConfig(landing_rounds=2))
-        for stage in [*network.among, network.landing] if kind == "seeded" else []:
+        network = ProjectionNetwork(ProjectionConfig(landing_rounds=2, messages=48 if kind == "wide" else 0))
+        for stage in [*network.among, network.landing] if kind in ("seeded", "wide") else []:
             stage.step.head.weight.normal_(std=0.1)
     return Model.of(network, kind)

@@ -75,7 +75,7 @@ def test_the_result_does_not_depend_on_the_number_of_threads(run: Run) -> None:
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", ["default", "unsupervised"])
+@pytest.mark.parametrize("name", ["default", "unsupervised", "wide"])
 @pytest.mark.parametrize("share", [1, 0.2])
 def test_compiled_code_and_torch_agree(name: str, share: float, rng: np.random.Generator) -> None:
     # Both round to float32; a hundred-thousandth of the spacing is a hundred times less than a scanner's last digit.
@@ -83,7 +83,8 @@ def test_compiled_code_and_torch_agree(name: str, share: float, rng: np.random.G
     points = ordered(noisy.noisy)
     coarse = seeds_of(points, share)
     count = coarse.count if share < 1 else rng.integers(1, 9, 1501).astype(float)
-    given = (store.load(name), coarse.points, count, points if share < 1 else None, noisy.spacing)
+    weights = model(name) if name == "wide" else store.load(name)
+    given = (weights, coarse.points, count, points if share < 1 else None, noisy.spacing)
     (by_torch, shape), (moved, its_shape) = in_torch(*given), compiled(*given, threads=2, block_points=400)
     np.testing.assert_allclose(its_shape, shape, atol=1e-5 * noisy.spacing)
     assert moves(moved, by_torch).max() < 1e-5 * noisy.spacing

@@ -97,6 +97,7 @@ def test_a_saved_model_comes_back_weight_by_weight_and_byte_by_byte(folder: Path
     [
         ProjectionConfig(4, 6, (1,), 1),
         ProjectionConfig(16, 32, (1, 2, 3), 2),
+        ProjectionConfig(8, 12, (2,), 1, messages=12),
         MCConvConfig(8, None, 0.0, unit=5.0),
         MCConvConfig(64, 16, 0.2),
     ],

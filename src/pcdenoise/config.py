@@ -88,6 +88,9 @@ class TrainConfig(Settings):
     neighbours: int = Field(32, ge=6, le=256, description="Neighbours that a point looks at.")
     rounds: tuple[int, ...] = Field((2, 2), min_length=1, description="Rounds of messages in each stage.")
     landing_rounds: int = Field(2, ge=1, le=8, description="Rounds of messages in which all points land on the seeds' surface.")
+    messages: int | None = Field(
+        None, ge=4, le=256, description="Channels of a message; as many as features, or as the model has that it starts from."
+    )
     data: tuple[str, ...] = Field(
         ("shapes:400",), min_length=1, description="What to learn from: shapes:N, meshes, scans, folders; each as often."
     )

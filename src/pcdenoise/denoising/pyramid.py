@@ -169,9 +169,9 @@ class _Looking:
             def exchange(block: slice, graph: Edges) -> tuple[Tensor, ...]:
                 mine = planes.block(block)
                 edge, a, b = self._features(block, graph, mine, planes)
-                message, news = layer(edge, graph, before[block], heard)  # noqa: B023
+                known, news = layer(edge, graph, before[block], heard, stage.step.head if last else None)  # noqa: B023
                 on_block(block.stop - block.start)
-                return (news, stage.step(message, graph, mine, planes, a, b)) if last else (news,)  # noqa: B023
+                return (news, stage.step(known, graph, mine, planes, a, b)) if last else (news,)  # noqa: B023
 
             features, *moves = self.over_blocks(exchange)
             move = moves[0] if last else move
@@ -185,10 +185,10 @@ class _Looking:
             mine, noise = planes(graph), self.noise[block]
             features = stage.embed(point_features(graph, mine, noise))
             edge, a, b = edge_features(graph, mine, theirs, noise)
-            for layer, said in zip(stage.exchanges, heard, strict=True):
-                message, features = layer(edge, graph, features, said)
+            for number, (layer, said) in enumerate(zip(stage.exchanges, heard, strict=True), start=1):
+                known, features = layer(edge, graph, features, said, stage.step.head if number == len(heard) else None)
                 on_block(block.stop - block.start)
-            return (stage.step(message, graph, mine, theirs, a, b),)
+            return (stage.step(known, graph, mine, theirs, a, b),)
 
         return self.over_blocks(land)[0]
 

@@ -205,7 +205,7 @@ def _neighbours(network: store.Network) -> int:
 
 
 def _initial(config: TrainConfig, init: str | None) -> store.Network:
-    """A new network, or one with the weights and sizes of another model; only the number of neighbours is free then."""
+    """A new network, or one with the weights and sizes of another model; only neighbours, and wider messages, are free then."""
     if init is not None and init != FROM_NOTHING:
         learned = store.load(init).network
         if isinstance(learned, MCConvNetwork) != (config.network == "mcconv"):
@@ -215,9 +215,16 @@ def _initial(config: TrainConfig, init: str | None) -> store.Network:
                 unit = learned.config.unit or "the diagonal"
                 raise UsageError(f"--init {init}: its unit of length is {unit}; give the same --unit")
             return copy.deepcopy(learned).train()
-        network = ProjectionNetwork(replace(learned.config, neighbours=config.neighbours))
-        network.load_state_dict(learned.state_dict())
+        messages = config.messages or learned.config.messages
+        if messages < learned.config.messages:
+            raise UsageError(f"--init {init}: its messages have {learned.config.messages} channels; give no fewer than that")
+        network = ProjectionNetwork(replace(learned.config, neighbours=config.neighbours, messages=messages))
+        network.take(learned)
         return network
     if config.network == "mcconv":
         return MCConvNetwork(MCConvConfig(config.width, config.sampled, unit=config.unit))
-    return ProjectionNetwork(ProjectionConfig(config.channels, config.neighbours, config.rounds, config.landing_rounds))
+    return ProjectionNetwork(
+        ProjectionConfig(
+            config.channels, config.neighbours, config.rounds, config.landing_rounds, config.messages or config.channels
+        )
+    )

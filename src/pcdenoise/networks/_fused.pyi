@@ -6,7 +6,7 @@ Surroundings: TypeAlias = tuple[int, int, int, int, int, int]
 """points, sources, index, count, neighbours of a point, noise."""
 
 def look(around: Surroundings, start: int, stop: int, embedding: int, normals: int, shapes: int, features: int, /) -> None: ...
-def hear(features: int, start: int, stop: int, weight: int, heard: int, /) -> None: ...
+def hear(features: int, start: int, stop: int, weight: int, heard: int, width: int, /) -> None: ...
 def talk(
     around: Surroundings,
     start: int,
@@ -21,5 +21,6 @@ def talk(
     features: int,
     head: int,
     moves: int,
+    width: int,
     /,
 ) -> None: ...

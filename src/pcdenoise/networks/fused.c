@@ -7,18 +7,11 @@
 #include <Python.h>
 
 #include "../cloud/geometry.h"
+#include "channels.h"
 
-#define CHANNELS 32
-#define LANES 8
-#define VECTORS (CHANNELS / LANES)
-#define EDGE_FEATURES 8
 #define POINT_FEATURES 4
 #define MOST_NEIGHBOURS 64
 #define KERNEL_SHARE 0.7f
-
-typedef float Lanes __attribute__((vector_size(LANES * sizeof(float)), aligned(4), may_alias));
-typedef int32_t Mask __attribute__((vector_size(LANES * sizeof(int32_t)), aligned(4), may_alias));
-typedef struct { Lanes part[VECTORS]; } Channels;
 
 typedef struct {
     const double *points, *sources; /* (M, 3), (N, 3) */
@@ -35,47 +28,27 @@ typedef struct {
     float weight[MOST_NEIGHBOURS];                             /* of sum one */
 } Neighbourhood;
 
-typedef struct {
-    float edge[EDGE_FEATURES][CHANNELS], edge_bias[CHANNELS];
-    float own[CHANNELS][CHANNELS];
-    float message[CHANNELS][CHANNELS], message_bias[CHANNELS];
-    float update[2 * CHANNELS][CHANNELS], update_bias[CHANNELS];
-    float norm_gain[CHANNELS], norm_bias[CHANNELS];
+typedef struct { /* a layer's weights lie input by input */
+    const float *edge, *edge_bias, *own, *message, *message_bias, *update, *update_bias, *norm_gain, *norm_bias;
 } Round;
 
 typedef struct { float weight[POINT_FEATURES][CHANNELS], bias[CHANNELS]; } Embedding;
-typedef struct { float weight[3][CHANNELS], bias[3]; } Head;
 
-INLINE float larger(float one, float other) { return one > other ? one : other; }
-
-INLINE Channels load(const float *from) {
-    Channels c;
-    for (int v = 0; v < VECTORS; v++) c.part[v] = ((const Lanes *)from)[v];
-    return c;
-}
-
-INLINE void store(float *to, Channels c) {
-    for (int v = 0; v < VECTORS; v++) ((Lanes *)to)[v] = c.part[v];
-}
-
-INLINE Channels not_negative(Channels c) { /* a NaN stays one */
-    for (int v = 0; v < VECTORS; v++) c.part[v] = (Lanes)((Mask)c.part[v] & ~(c.part[v] < 0));
-    return c;
-}
-
-INLINE Channels plus(Channels sum, Channels c) {
-    for (int v = 0; v < VECTORS; v++) sum.part[v] += c.part[v];
-    return sum;
-}
-
-INLINE Channels plus_scaled(Channels sum, float factor, Channels c) {
-    for (int v = 0; v < VECTORS; v++) sum.part[v] += factor * c.part[v];
-    return sum;
-}
-
-INLINE Channels layer(Channels sum, const float *input, int n, const float *weight) {
-    for (int i = 0; i < n; i++) sum = plus_scaled(sum, input[i], load(weight + i * CHANNELS));
-    return sum;
+/* The weights of a round of messages of some width: moves on to the next round's. */
+INLINE Round next_round(const float **weights, const int width) {
+    const float *at = *weights;
+    Round round;
+    round.edge = at, at += EDGE_FEATURES * width;
+    round.edge_bias = at, at += width;
+    round.own = at, at += CHANNELS * width;
+    round.message = at, at += width * width;
+    round.message_bias = at, at += width;
+    round.update = at, at += 2 * width * CHANNELS;
+    round.update_bias = at, at += CHANNELS;
+    round.norm_gain = at, at += CHANNELS;
+    round.norm_bias = at, at += CHANNELS;
+    *weights = at;
+    return round;
 }
 
 /* exp(-x) for 0 <= x <= 1 / KERNEL_SHARE² to float32's rounding, without a call, so that a loop of it runs in lanes. */
@@ -144,7 +117,8 @@ static ANY_PROCESSOR void look(const Surroundings *around, int64_t start, int64_
         const float thin = shape[0] / near.scale, middle = shape[1] / near.scale, wide = shape[2] / near.scale;
         const float level = around->noise[i] / near.scale;
         const float known[POINT_FEATURES] = {2 * thin, 2 * (wide - middle), 4 * level / (1 + level), thin / (thin + level + 1e-6f)};
-        store(features + CHANNELS * i, layer(load(embedding->bias), known, POINT_FEATURES, embedding->weight[0]));
+        store(features + CHANNELS * i, layer(load(embedding->bias, CHANNELS), known, POINT_FEATURES, embedding->weight[0], CHANNELS),
+              CHANNELS);
     }
 }
 
@@ -180,51 +154,52 @@ INLINE void edges(Edges *edge, const Neighbourhood *near, const float *own, cons
 }
 
 /* The messages of two edges, each a layer over its features, what both ends say added, and a second layer. Two at a time share
-   every load of a weight and keep eight sums going, as many as the processor's multipliers take to be busy. */
-INLINE void say(const Round *round, const float *const feature[2], Channels own, const float *const heard[2], float *const message[2]) {
-    Channels one = plus(own, load(heard[0])), other = plus(own, load(heard[1]));
-    float hidden[2][CHANNELS];
+   every load of a weight and keep eight or twelve sums going, as many as the processor's multipliers take to be busy. */
+INLINE void say(const Round *round, const float *const feature[2], Channels own, const float *const heard[2], float *const message[2],
+                const int width) {
+    Channels one = plus(own, load(heard[0], width), width), other = plus(own, load(heard[1], width), width);
+    float hidden[2][MOST_CHANNELS];
     for (int i = 0; i < EDGE_FEATURES; i++) {
-        const Channels weight = load(round->edge[i]);
-        one = plus_scaled(one, feature[0][i], weight), other = plus_scaled(other, feature[1][i], weight);
+        const Channels weight = load(round->edge + i * width, width);
+        one = plus_scaled(one, feature[0][i], weight, width), other = plus_scaled(other, feature[1][i], weight, width);
     }
-    store(hidden[0], not_negative(one)), store(hidden[1], not_negative(other));
-    one = other = load(round->message_bias);
-    for (int i = 0; i < CHANNELS; i++) {
-        const Channels weight = load(round->message[i]);
-        one = plus_scaled(one, hidden[0][i], weight), other = plus_scaled(other, hidden[1][i], weight);
+    store(hidden[0], not_negative(one, width), width), store(hidden[1], not_negative(other, width), width);
+    one = other = load(round->message_bias, width);
+    for (int i = 0; i < width; i++) {
+        const Channels weight = load(round->message + i * width, width);
+        one = plus_scaled(one, hidden[0][i], weight, width), other = plus_scaled(other, hidden[1][i], weight, width);
     }
-    store(message[0], not_negative(one)), store(message[1], not_negative(other));
+    store(message[0], not_negative(one, width), width), store(message[1], not_negative(other, width), width);
 }
 
-/* One exchange: (K, C) messages, and the point's features replaced by what it makes of them. */
+/* One exchange: (K, width) messages, and the point's features replaced by what it makes of them. */
 INLINE void exchange(const Round *round, const Neighbourhood *near, const Edges *edge, const int32_t *index,
-                     const float *heard, float *features, float messages[][CHANNELS]) {
-    const Channels own = layer(load(round->edge_bias), features, CHANNELS, round->own[0]);
-    Channels mean = {{{0}}}, most = {{{0}}};
+                     const float *heard, float *features, float *messages, const int width) {
+    const Channels own = layer(load(round->edge_bias, width), features, CHANNELS, round->own, width);
+    Channels mean = none(width), most = none(width);
     float most_weight = 1e-12f;
     for (int j = 0; j < near->k; j++) most_weight = larger(most_weight, near->weight[j]);
     for (int j = 0; j < near->k; j += 2) {
         const int other = j + 1 < near->k ? j + 1 : j; /* the last of an odd number is made twice */
         const float *const feature[2] = {edge->feature[j], edge->feature[other]};
-        const float *const said[2] = {heard + CHANNELS * (size_t)index[j], heard + CHANNELS * (size_t)index[other]};
-        float *const message[2] = {messages[j], messages[other]};
-        say(round, feature, own, said, message);
+        const float *const said[2] = {heard + width * (size_t)index[j], heard + width * (size_t)index[other]};
+        float *const message[2] = {messages + j * width, messages + other * width};
+        say(round, feature, own, said, message, width);
     }
     for (int j = 0; j < near->k; j++) {
-        const Channels message = load(messages[j]);
+        const Channels message = load(messages + j * width, width);
         const float weight = near->weight[j], share = weight / most_weight;
-        for (int v = 0; v < VECTORS; v++) {
+        for (int v = 0; v < width / LANES; v++) {
             const Lanes shared = share * message.part[v];
             const Mask more = shared > most.part[v];
             mean.part[v] += weight * message.part[v];
             most.part[v] = (Lanes)(((Mask)shared & more) | ((Mask)most.part[v] & ~more));
         }
     }
-    float pooled[2 * CHANNELS], news[CHANNELS], average = 0, variance = 0;
-    store(pooled, mean);
-    store(pooled + CHANNELS, most);
-    store(news, layer(load(round->update_bias), pooled, 2 * CHANNELS, round->update[0]));
+    float pooled[2 * MOST_CHANNELS], news[CHANNELS], average = 0, variance = 0;
+    store(pooled, mean, width);
+    store(pooled + width, most, width);
+    store(news, layer(load(round->update_bias, CHANNELS), pooled, 2 * width, round->update, CHANNELS), CHANNELS);
     for (int c = 0; c < CHANNELS; c++) average += (news[c] += features[c]);
     average /= CHANNELS;
     for (int c = 0; c < CHANNELS; c++) variance += (news[c] - average) * (news[c] - average);
@@ -233,15 +208,16 @@ INLINE void exchange(const Round *round, const Neighbourhood *near, const Edges 
         features[c] = (news[c] - average) * sharpen * round->norm_gain[c] + round->norm_bias[c];
 }
 
-INLINE void step(const Head *head, const Neighbourhood *near, const Edges *edge, const float *own,
-                 float messages[][CHANNELS], float *move) {
+INLINE void step(const float *head, const Neighbourhood *near, const Edges *edge, const float *own,
+                 const float *messages, float *move, const int width) {
+    const float *bias = head + 3 * width;
     float total = 0, lifted = 0, x = 0, y = 0, z = 0;
     for (int j = 0; j < near->k; j++) {
         float known[3];
         for (int h = 0; h < 3; h++) {
             float sum = 0;
-            for (int c = 0; c < CHANNELS; c++) sum += head->weight[h][c] * messages[j][c];
-            known[h] = sum + head->bias[h];
+            for (int c = 0; c < width; c++) sum += head[h * width + c] * messages[j * width + c];
+            known[h] = sum + bias[h];
         }
         const float bounded = 1 - 2 / (expf(known[0] / 2) + 1); /* tanh of a quarter */
         const float weight = near->weight[j] * expf(4 * bounded);
@@ -256,32 +232,49 @@ INLINE void step(const Head *head, const Neighbourhood *near, const Edges *edge,
     move[2] = length * (z + lifted * own[2]);
 }
 
-/* Rounds of messages of the points in rows [start, stop), and their step where there is a head.
+typedef struct {
+    const float *normals, *their_normals; /* (M, 3), (N, 3) */
+    const float *rounds, *head;           /* weights; no head, no step */
+    const float *heard;                   /* what sources say in each round, one array (N, width) after the other */
+    int64_t n_heard;                      /* floats in each of them */
+    const float *before;                  /* (M, C) features so far */
+    float *features, *moves;              /* (M, C), (M, 3) what comes of it */
+    int n_rounds, width;
+} Talk;
 
-   `heard` holds what the sources say in each round, one array after the other, `n_heard` floats each. */
-static ANY_PROCESSOR void talk(const Surroundings *around, int64_t start, int64_t stop, const float *normals,
-                               const float *their_normals, const Round *rounds, int n_rounds, const float *heard, int64_t n_heard,
-                               const float *before, float *features, const Head *head, float *moves) {
+INLINE void talk_of_width(const Surroundings *around, int64_t start, int64_t stop, const Talk *talk, const int width) {
     Neighbourhood near;
     Edges edge;
-    float messages[MOST_NEIGHBOURS][CHANNELS];
+    float messages[MOST_NEIGHBOURS * MOST_CHANNELS];
     for (int64_t i = start; i < stop; i++) {
         const int32_t *row = around->index + i * around->k;
+        const float *normal = talk->normals + 3 * i, *weights = talk->rounds;
         float own[CHANNELS];
         neighbourhood(&near, around, i);
-        edges(&edge, &near, normals + 3 * i, their_normals, row, around->noise[i]);
-        memcpy(own, before + CHANNELS * i, sizeof own);
-        for (int r = 0; r < n_rounds; r++) exchange(rounds + r, &near, &edge, row, heard + r * n_heard, own, messages);
-        memcpy(features + CHANNELS * i, own, sizeof own);
-        if (head) step(head, &near, &edge, normals + 3 * i, messages, moves + 3 * i);
+        edges(&edge, &near, normal, talk->their_normals, row, around->noise[i]);
+        memcpy(own, talk->before + CHANNELS * i, sizeof own);
+        for (int r = 0; r < talk->n_rounds; r++) {
+            const Round round = next_round(&weights, width);
+            exchange(&round, &near, &edge, row, talk->heard + r * talk->n_heard, own, messages, width);
+        }
+        memcpy(talk->features + CHANNELS * i, own, sizeof own);
+        if (talk->head) step(talk->head, &near, &edge, normal, messages, talk->moves + 3 * i, width);
     }
 }
 
+/* Rounds of messages of the points in rows [start, stop), and their step where there is a head. */
+static ANY_PROCESSOR void talk(const Surroundings *around, int64_t start, int64_t stop, const Talk *talk) {
+    if (talk->width == CHANNELS) talk_of_width(around, start, stop, talk, CHANNELS);
+    else talk_of_width(around, start, stop, talk, MOST_CHANNELS);
+}
+
 /* What sources say in a round, from their features. */
-static ANY_PROCESSOR void hear(const float *features, int64_t start, int64_t stop, const float *weight, float *heard) {
-    const Channels nothing = {{{0}}};
-    for (int64_t i = start; i < stop; i++)
-        store(heard + CHANNELS * i, layer(nothing, features + CHANNELS * i, CHANNELS, weight));
+static ANY_PROCESSOR void hear(const float *features, int64_t start, int64_t stop, const float *weight, float *heard, int width) {
+    for (int64_t i = start; i < stop; i++) {
+        const float *feature = features + CHANNELS * i;
+        if (width == CHANNELS) store(heard + width * i, layer(none(CHANNELS), feature, CHANNELS, weight, CHANNELS), CHANNELS);
+        else store(heard + width * i, layer(none(MOST_CHANNELS), feature, CHANNELS, weight, MOST_CHANNELS), MOST_CHANNELS);
+    }
 }
 
 /* For Python, which gives arrays by their addresses (fused.py) and lets other threads go on meanwhile. */
@@ -312,26 +305,30 @@ static PyObject *call_look(PyObject *self, PyObject *args) {
 static PyObject *call_hear(PyObject *self, PyObject *args) {
     unsigned long long features, weight, heard;
     long long start, stop;
+    int width;
     (void)self;
-    if (!PyArg_ParseTuple(args, "KLLKK", &features, &start, &stop, &weight, &heard)) return NULL;
+    if (!PyArg_ParseTuple(args, "KLLKKi", &features, &start, &stop, &weight, &heard, &width)) return NULL;
     Py_BEGIN_ALLOW_THREADS
-    hear(AT(float, features), start, stop, AT(float, weight), AT(float, heard));
+    hear(AT(float, features), start, stop, AT(float, weight), AT(float, heard), width);
     Py_END_ALLOW_THREADS
     Py_RETURN_NONE;
 }
 
 static PyObject *call_talk(PyObject *self, PyObject *args) {
     Surroundings around;
+    Talk given;
     unsigned long long normals, their_normals, rounds, heard, before, features, head, moves;
     long long start, stop, n_heard;
-    int n_rounds;
     (void)self;
-    if (!PyArg_ParseTuple(args, "O&LLKKKiKLKKKK", surroundings, &around, &start, &stop, &normals, &their_normals, &rounds,
-                          &n_rounds, &heard, &n_heard, &before, &features, &head, &moves))
+    if (!PyArg_ParseTuple(args, "O&LLKKKiKLKKKKi", surroundings, &around, &start, &stop, &normals, &their_normals, &rounds,
+                          &given.n_rounds, &heard, &n_heard, &before, &features, &head, &moves, &given.width))
         return NULL;
+    given.normals = AT(float, normals), given.their_normals = AT(float, their_normals);
+    given.rounds = AT(float, rounds), given.head = AT(float, head);
+    given.heard = AT(float, heard), given.n_heard = n_heard;
+    given.before = AT(float, before), given.features = AT(float, features), given.moves = AT(float, moves);
     Py_BEGIN_ALLOW_THREADS
-    talk(&around, start, stop, AT(float, normals), AT(float, their_normals), AT(Round, rounds), n_rounds, AT(float, heard), n_heard,
-         AT(float, before), AT(float, features), AT(Head, head), AT(float, moves));
+    talk(&around, start, stop, &given);
     Py_END_ALLOW_THREADS
     Py_RETURN_NONE;
 }

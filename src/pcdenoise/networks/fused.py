@@ -25,7 +25,7 @@ except ImportError:
 else:
     IS_BUILT = True
 
-CHANNELS, MOST_NEIGHBOURS = 32, 64
+CHANNELS, MESSAGES, MOST_NEIGHBOURS = 32, (32, 48), 64
 """What the compiled code is made for."""
 
 Values = NDArray[np.float32]
@@ -35,12 +35,12 @@ Noise = float | NDArray[np.float64]
 
 def fits(sizes: ProjectionSettings) -> bool:
     """Whether compiled code is there and made for networks of these sizes."""
-    return IS_BUILT and sizes.channels == CHANNELS and sizes.neighbours <= MOST_NEIGHBOURS
+    return IS_BUILT and sizes.channels == CHANNELS and sizes.message_channels in MESSAGES and sizes.neighbours <= MOST_NEIGHBOURS
 
 
 @dataclass(frozen=True)
 class _Stage:
-    """Weights as fused.c takes them. rounds (R, …), what they hear by (R, C, C)."""
+    """Weights as fused.c takes them. rounds (R, …), what they hear by (R, C, M), M being the width of a message."""
 
     embedding: Values
     rounds: Values
@@ -91,12 +91,12 @@ class _Surroundings:
         return normals, shapes, features
 
     def hear(self, hearing: Values, features: Values) -> Values:
-        """(R, N, C) what sources say in each round, by (R, C, C) weights, from their features (N, C)."""
-        heard = _empty(len(hearing), *features.shape)
+        """(R, N, M) what sources say in each round, by (R, C, M) weights, from their features (N, C)."""
+        heard = _empty(len(hearing), len(features), hearing.shape[2])
         for weight, said in zip(hearing, heard, strict=True):
 
             def hear_some(rows: slice) -> None:
-                _fused.hear(_at(features), rows.start, rows.stop, _at(weight), _at(said))  # noqa: B023
+                _fused.hear(_at(features), rows.start, rows.stop, _at(weight), _at(said), said.shape[1])  # noqa: B023
 
             self.over(hear_some, len(features))
         return heard
@@ -106,14 +106,15 @@ class _Surroundings:
     ) -> tuple[Values, Values]:
         """Features (M, C) after these rounds of messages, and the points' step (M, 3) where there is a head.
 
-        normals: the points' (M, 3) and the sources' (N, 3); heard (R, N, C); before (M, C): features so far.
+        normals: the points' (M, 3) and the sources' (N, 3); heard (R, N, …); before (M, C): features so far.
         """
         features, moves = np.empty_like(before), _empty(len(before) if head is not None else 0, 3)
 
         def talk(rows: slice) -> None:
             _fused.talk(
                 self._given, rows.start, rows.stop, _at(normals[0]), _at(normals[1]),
-                _at(rounds), len(rounds), _at(heard), heard[0].size, _at(before), _at(features), _at(head), _at(moves),
+                _at(rounds), len(rounds), _at(heard), heard[0].size, _at(before),
+                _at(features), _at(head), _at(moves), heard.shape[2],
             )  # fmt: skip
             self.on_block((rows.stop - rows.start) * len(rounds))
 

@@ -21,12 +21,19 @@ _KERNEL_SHARE = 0.7  # the kernel's unit of length as a share of the distance to
 
 @dataclass(frozen=True)
 class ProjectionConfig:
-    """Sizes of the network: feature channels, neighbours per point, rounds of messages in each stage."""
+    """Sizes of the network: feature channels, neighbours per point, rounds of messages in each stage, channels of a message.
+
+    messages: 0 stands for as many as features have.
+    """
 
     channels: int = 32
     neighbours: int = 24
     rounds: tuple[int, ...] = (2, 2)
     landing_rounds: int = 1
+    messages: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "messages", self.messages or self.channels)
 
 
 class Edges(NamedTuple):
@@ -157,13 +164,13 @@ def edge_features(graph: Edges, own: Planes, theirs: Planes, noise: Tensor) -> t
 class MessageRound(nn.Module):
     """One exchange between points and their sources: m = MLP(e, h_i, h_j) on every edge, pooled into the points' features."""
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, messages: int) -> None:
         super().__init__()
-        self.edge = nn.Linear(N_EDGE_FEATURES, channels)
-        self.own = nn.Linear(channels, channels, bias=False)
-        self.their = nn.Linear(channels, channels, bias=False)
-        self.message = nn.Linear(channels, channels)
-        self.update = nn.Linear(2 * channels, channels)
+        self.edge = nn.Linear(N_EDGE_FEATURES, messages)
+        self.own = nn.Linear(channels, messages, bias=False)
+        self.their = nn.Linear(channels, messages, bias=False)
+        self.message = nn.Linear(messages, messages)
+        self.update = nn.Linear(2 * messages, channels)
         self.norm = nn.LayerNorm(channels)
 
     def hear(self, their: Tensor) -> Tensor:
@@ -171,11 +178,17 @@ class MessageRound(nn.Module):
         said: Tensor = self.their(their)
         return said
 
-    def forward(self, features: Tensor, graph: Edges, own: Tensor, heard: Tensor) -> tuple[Tensor, Tensor]:
-        """Messages (M, K, C) and the points' new features (M, C). features (M, K, 8), own (M, C), heard (N, C)."""
-        layers = [(layer.weight, layer.bias) for layer in (self.edge, self.message)]
-        message, mean, most = exchange(features, self.own(own), heard, graph.source, graph.weight, *layers)
-        return message, self.norm(own + self.update(torch.cat([mean, most], dim=-1)))
+    def forward(
+        self, features: Tensor, graph: Edges, own: Tensor, heard: Tensor, head: nn.Linear | None = None
+    ) -> tuple[Tensor | None, Tensor]:
+        """What a head makes of the messages (3, M, K), if there is one, and the points' new features (M, C).
+
+        features (M, K, 8), own (M, C), heard (N, C).
+        """
+        first, second = ((layer.weight, layer.bias) for layer in (self.edge, self.message))
+        last = None if head is None else (head.weight, head.bias)
+        mean, most, known = exchange(features, self.own(own), heard, graph.source, graph.weight, first, second, last)
+        return known, self.norm(own + self.update(torch.cat([mean, most], dim=-1)))
 
 
 class Step(nn.Module):
@@ -193,10 +206,9 @@ class Step(nn.Module):
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
 
-    def forward(self, message: Tensor, graph: Edges, own: Planes, theirs: Planes, a: Tensor, b: Tensor) -> Tensor:
-        """(M, 3) displacement in the unit of `graph.scale`'s lengths."""
-        known = self.head.weight @ message.flatten(0, 1).t() + self.head.bias[:, None]
-        sharpness, pull, lift = known.view(3, *message.shape[:2])
+    def forward(self, known: Tensor, graph: Edges, own: Planes, theirs: Planes, a: Tensor, b: Tensor) -> Tensor:
+        """(M, 3) displacement in the unit of `graph.scale`'s lengths. known (3, M, K): ω, β and α of each edge, by the head."""
+        sharpness, pull, lift = known
         weight = graph.weight * torch.exp(4 * torch.tanh(sharpness / 4))
         weight = weight / weight.sum(-1, keepdim=True).clamp_min(1e-12)
         pulled = ((weight * (0.5 + pull) * b)[:, :, None] * at(theirs.normal, graph.source)).sum(1)
@@ -208,11 +220,11 @@ class Step(nn.Module):
 class Stage(nn.Module):
     """Some rounds of messages, then one step."""
 
-    def __init__(self, channels: int, rounds: int) -> None:
+    def __init__(self, channels: int, messages: int, rounds: int) -> None:
         super().__init__()
         self.embed = nn.Linear(N_POINT_FEATURES, channels)
-        self.rounds = nn.ModuleList(MessageRound(channels) for _ in range(rounds))
-        self.step = Step(channels)
+        self.rounds = nn.ModuleList(MessageRound(channels, messages) for _ in range(rounds))
+        self.step = Step(messages)
 
     @property
     def exchanges(self) -> list[MessageRound]:
@@ -226,10 +238,25 @@ class ProjectionNetwork(nn.Module):
     def __init__(self, config: ProjectionConfig) -> None:
         super().__init__()
         self.config = config
-        self.stages = nn.ModuleList(Stage(config.channels, rounds) for rounds in config.rounds)
-        self.landing = Stage(config.channels, config.landing_rounds)
+        self.stages = nn.ModuleList(Stage(config.channels, config.messages, rounds) for rounds in config.rounds)
+        self.landing = Stage(config.channels, config.messages, config.landing_rounds)
 
     @property
     def among(self) -> list[Stage]:
         """The stages in which seeds look at each other, in order."""
         return [stage for stage in self.stages if isinstance(stage, Stage)]
+
+    def take(self, learned: ProjectionNetwork) -> None:
+        """The weights of a network whose messages are no wider: channels that are more here are not heard as yet.
+
+        So both do the same before anything is learned (net2net: Chen, Goodfellow and Shlens 2016).
+        """
+        theirs, extra = learned.state_dict(), self.config.messages - learned.config.messages
+        with torch.no_grad():
+            for name, own in self.state_dict().items():
+                given = theirs[name]
+                if name.endswith("update.weight"):  # hears means and maxima side by side
+                    given = torch.cat([nn.functional.pad(part, (0, extra)) for part in given.chunk(2, dim=1)], dim=1)
+                elif name.endswith(("message.weight", "head.weight")):
+                    given = nn.functional.pad(given, (0, extra))
+                own[tuple(slice(length) for length in given.shape)] = given

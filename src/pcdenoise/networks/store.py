@@ -52,6 +52,12 @@ class ProjectionSettings(_Settings):
     neighbours: int = Field(ge=6, le=256)
     rounds: tuple[Annotated[int, Field(ge=1, le=8)], ...] = Field(min_length=1, max_length=8)
     landing_rounds: int = Field(ge=1, le=8)
+    messages: int = Field(0, ge=0, le=256)
+
+    @property
+    def message_channels(self) -> int:
+        """Channels of a message: as many as features where a model does not say."""
+        return self.messages or self.channels
 
 
 class _MCConvSettings(_Settings):
@@ -261,10 +267,10 @@ def _expected(config: ModelConfig) -> _Expected:
 
 def _projection_shapes(sizes: ProjectionSettings) -> Iterator[tuple[str, tuple[int, ...]]]:
     """What `ProjectionNetwork.state_dict` would say, without torch."""
-    c = sizes.channels
+    c, m = sizes.channels, sizes.message_channels
     a_round = {
-        "edge.weight": (c, 8), "edge.bias": (c,), "own.weight": (c, c), "their.weight": (c, c), "message.weight": (c, c),
-        "message.bias": (c,), "update.weight": (c, 2 * c), "update.bias": (c,), "norm.weight": (c,), "norm.bias": (c,),
+        "edge.weight": (m, 8), "edge.bias": (m,), "own.weight": (m, c), "their.weight": (m, c), "message.weight": (m, m),
+        "message.bias": (m,), "update.weight": (c, 2 * m), "update.bias": (c,), "norm.weight": (c,), "norm.bias": (c,),
     }  # fmt: skip
     stages = {f"stages.{number}": rounds for number, rounds in enumerate(sizes.rounds)}
     for stage, rounds in {**stages, "landing": sizes.landing_rounds}.items():
@@ -273,7 +279,7 @@ def _projection_shapes(sizes: ProjectionSettings) -> Iterator[tuple[str, tuple[i
         for number in range(rounds):
             for name, shape in a_round.items():
                 yield f"{stage}.rounds.{number}.{name}", shape
-        yield f"{stage}.step.head.weight", (3, c)
+        yield f"{stage}.step.head.weight", (3, m)
         yield f"{stage}.step.head.bias", (3,)
 
 
