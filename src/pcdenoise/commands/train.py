@@ -41,6 +41,9 @@ def train(
         bool, option("--pairs", help="supervised: learn from the noisy and clean clouds of synth folders, not from their meshes.")
     ] = False,
     neighbours: Annotated[int, option("--neighbours", help="projection: how many neighbours a point looks at.")] = 32,
+    messages: Annotated[
+        int | None, option("--messages", help="projection: channels of a message; with --init as many as there, or more.")
+    ] = None,
     learning_rate: Annotated[
         float | None,
         option(
@@ -95,7 +98,8 @@ def train(
     from pcdenoise.learning import ranks, trainer
 
     settings = configured(
-        TrainConfig, data=data, method=method, network=network, pairs=pairs, neighbours=neighbours, learning_rate=learning_rate,
+        TrainConfig, data=data, method=method, network=network, pairs=pairs, neighbours=neighbours, messages=messages,
+        learning_rate=learning_rate,
         prior=prior, kernel=kernel, alpha=alpha, beta=beta, unit=unit, part_points=part_points, laps=laps,
         steps=steps, budget_s=_seconds(budget), seed=seed, threads=threads,
     )  # fmt: skip
