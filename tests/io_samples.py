@@ -225,6 +225,34 @@ XYZ = {
 """Text scans of three rows in many dialects."""
 
 
+_PTX_POSE = b"""600000.000000 800000.000000 400.000000
+1 0 0
+0 1 0
+0 0 2
+0.8 0.6 0 0
+-0.6 0.8 0 0
+0 0 2 0
+600000.000000 800000.000000 400.000000 1
+"""
+_PTX_HOME = b"0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
+_PTX_POINTS = b"""37.24 49.31 15.830 0.034912
+36.33 49.70 23.195 0.004395
+0 0 0 0.5
+36.78 49.66 13.355 0.028809
+36.38 48.01 12.695 0.024414
+37.38 48.21 12.695 0.024414
+"""
+PTX = {
+    "bare": b"2\n3\n" + _PTX_HOME + _PTX_POINTS,
+    "colours": b"6\r\n1\r\n" + _PTX_HOME.replace(b"\n", b"\r\n")
+    + b"".join(b"%d.5 %d.25 1.125 0.%d 25%d 0 %d\r\n" % (i, i * i, i + 1, i, i + 7) for i in range(6)),
+    "two stations": b"2\n3\n" + _PTX_POSE + _PTX_POINTS + b"6\n1\n" + _PTX_HOME + _PTX_POINTS.replace(b"0 0 0 ", b"9 9 9 "),
+    "no last line ending": (b"3\n2\n" + _PTX_POSE + _PTX_POINTS).rstrip(b"\n"),
+    "one with colours": b"1\n6\n" + _PTX_HOME + _PTX_POINTS + b"1\n1\n" + _PTX_POSE + b"1.5 2.5 3.5 0.25 1 2 3\n\n",
+}  # fmt: skip
+"""Files of a terrestrial scanner: a grid, or several, posed or not, with a point that was not seen."""
+
+
 def _crc32c(data: bytes) -> int:
     """Bit by bit, as its definition goes."""
     crc = 0xFFFFFFFF

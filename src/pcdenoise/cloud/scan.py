@@ -32,7 +32,7 @@ class Scan:
 
     points      (N, 3) float64, file units; rows may be NaN or infinite (organised clouds): see `finite`.
     attributes  name -> (N,) array in the file's own dtype, everything per point except x, y, z.
-    format      'las', 'laz', 'ply', 'xyz', 'pcd', 'bin' or 'e57'.
+    format      'las', 'laz', 'ply', 'xyz', 'pcd', 'bin', 'e57' or 'ptx'.
     origin      where it was read from, for messages.
     source      what the format's own module needs to write the file back as it was; opaque to everyone else.
     added       names of attributes that were not in the file (displacement, outlier flag, …).

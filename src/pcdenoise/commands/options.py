@@ -163,7 +163,7 @@ Config = Annotated[
     common("--config", is_eager=True, callback=_apply_config, metavar="FILE", help="TOML file with values for any options."),
 ]
 OneOutput = Annotated[str, option("--output", "-o", metavar="OUT", help="A file, or - for stdout.")]
-_Formats = Literal["las", "laz", "ply", "xyz", "pcd", "bin", "e57"]
+_Formats = Literal["las", "laz", "ply", "xyz", "pcd", "bin", "e57", "ptx"]
 _OF_NAMELESS = "Format of - and of files without a known suffix"
 Format = Annotated[_Formats | None, option("--format", help=f"{_OF_NAMELESS}; into a folder: convert to it.")]
 FormatRead = Annotated[_Formats | None, option("--format", help=f"{_OF_NAMELESS}.")]

@@ -99,9 +99,8 @@ def train(
 
     settings = configured(
         TrainConfig, data=data, method=method, network=network, pairs=pairs, neighbours=neighbours, messages=messages,
-        learning_rate=learning_rate,
-        prior=prior, kernel=kernel, alpha=alpha, beta=beta, unit=unit, part_points=part_points, laps=laps,
-        steps=steps, budget_s=_seconds(budget), seed=seed, threads=threads,
+        learning_rate=learning_rate, prior=prior, kernel=kernel, alpha=alpha, beta=beta, unit=unit, part_points=part_points,
+        laps=laps, steps=steps, budget_s=_seconds(budget), seed=seed, threads=threads,
     )  # fmt: skip
     refuse_unwritable([output / "config.json"], overwrite or resume)
     refuse_unwritable([report], overwrite)

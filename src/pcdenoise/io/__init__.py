@@ -17,17 +17,19 @@ import numpy as np
 
 from pcdenoise.cloud.scan import Mask, Scan
 from pcdenoise.errors import ScanError
-from pcdenoise.io import e57, files, kitti, las, pcd, ply, text, xyz
+from pcdenoise.io import e57, files, kitti, las, pcd, ply, ptx, text, xyz
 from pcdenoise.io.crs import Crs
 from pcdenoise.io.source import changed, portable
 
 SUFFIXES = {
-    ".las": "las", ".laz": "laz", ".ply": "ply", ".pcd": "pcd", ".bin": "bin", ".e57": "e57",
+    ".las": "las", ".laz": "laz", ".ply": "ply", ".pcd": "pcd", ".bin": "bin", ".e57": "e57", ".ptx": "ptx",
     ".xyz": "xyz", ".txt": "xyz", ".csv": "xyz", ".asc": "xyz", ".pts": "xyz",
 }  # fmt: skip
 """File suffix -> format."""
 
-_MODULES: dict[str, ModuleType] = {"las": las, "laz": las, "ply": ply, "pcd": pcd, "bin": kitti, "e57": e57, "xyz": xyz}
+_MODULES: dict[str, ModuleType] = {
+    "las": las, "laz": las, "ply": ply, "pcd": pcd, "bin": kitti, "e57": e57, "ptx": ptx, "xyz": xyz,
+}  # fmt: skip
 _HEAD = 4096
 
 
@@ -112,7 +114,7 @@ class Stream(Protocol):
 
 @contextmanager
 def streamed(path: str | os.PathLike[str], *, format: str | None = None) -> Iterator[Stream | None]:
-    """A file as a stream, or None where it has to be read whole: stdin, PCD, KITTI, E57, PLY as text or with lists.
+    """A file as a stream, or None where it has to be read whole: stdin, PCD, KITTI, E57, PTX, PLY as text or with lists.
 
     Raises ScanError as `read` does, for what shows without reading the points.
     """
@@ -203,7 +205,7 @@ def rounding(scan: Scan) -> float:
         step = 4 * float(np.spacing(largest))
         if isinstance(scan.source, e57.E57Source):  # rounded in a station's own frame
             step = max(step, scan.source.step())
-        elif scan.format == "xyz":
+        elif scan.format in ("xyz", "ptx"):
             decimals = text.fewest_decimals(points.ravel())
             coarsest = text.COORDINATE_STEP * float(np.ptp(points, axis=0).max())
             step = max(step, coarsest if decimals is None else min(coarsest, 10.0**-decimals))
@@ -243,6 +245,8 @@ def _encode(scan: Scan, file: BinaryIO, format: str, suffix: str, provenance: Ma
             kitti.write(scan, file)
         case "e57":
             e57.write(scan, file, provenance=provenance)
+        case "ptx":
+            ptx.write(scan, file)
         case _:
             xyz.write(scan, file, suffix=suffix)
 
@@ -265,5 +269,5 @@ def _sniffed(head: bytes) -> str:
     """The format that the first bytes show; nothing if none."""
     if las.matches(head):
         return "laz" if las.is_compressed(head) else "las"
-    kinds: dict[str, Any] = {"ply": ply, "pcd": pcd, "e57": e57, "xyz": xyz}
+    kinds: dict[str, Any] = {"ply": ply, "pcd": pcd, "e57": e57, "ptx": ptx, "xyz": xyz}
     return next((name for name, module in kinds.items() if module.matches(head)), "")

@@ -23,15 +23,7 @@ from pcdenoise.io.e57_file import Container, Field, Layout
 from pcdenoise.io.e57_new import NAMES, NAMESPACES, OURS, PROVENANCE, added, created, described, storable
 from pcdenoise.io.e57_stations import BOUNDS, CARTESIAN, SPHERICAL, Records, Station, offset, prototype, stations_of
 from pcdenoise.io.e57_xml import Edits, Element, a_text, parsed
-from pcdenoise.io.source import (
-    Column,
-    changed,
-    free_name,
-    moved_rows,
-)
-
-STATION = "station"
-"""The column that says of which station a point is, where a file has several."""
+from pcdenoise.io.source import STATION, Column, changed, free_name, moved_rows
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,9 @@ Column = NDArray[Any]
 NUMBERS = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 """The number types that LAS extra bytes and PCD know, in the order of LAS' codes for them."""
 
+STATION = "station"
+"""The column that says which station measured a point, where a file has several."""
+
 _COMMON_NAMES = {
     "r": "red", "g": "green", "b": "blue", "a": "alpha", "diffuse_red": "red", "diffuse_green": "green", "diffuse_blue": "blue",
     "normal_x": "nx", "normal_y": "ny", "normal_z": "nz", "scalar_intensity": "intensity", "gpstime": "gps_time",
