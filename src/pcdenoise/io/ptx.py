@@ -1,6 +1,6 @@
 """PTX scans, as programs of terrestrial scanners exchange them: stations with poses, each a grid of points in its own frame.
 
-A point is a row `x y z intensity`, or with `red green blue` behind that. All stations of a file are one scan in world coordinates,
+A point is a row `x y z intensity`, or with `red green blue` behind that. All stations of a file are one scan in the world,
 as of an E57. Not here: rows and fields (text.py).
 """
 
