@@ -17,6 +17,7 @@ from pcdenoise.commands import main
 from pcdenoise.errors import ScanError
 from pcdenoise.io import e57, e57_file
 from pcdenoise.io.e57_file import Field
+from pcdenoise.io.e57_stations import Records
 
 KINDS = ("single", "double", "scaled", "integer", "spherical", "invalid")
 TOKENS = [b'"', b"<", b"nan", b"1e309", b"-1", b"9" * 30, b"\xff" * 8]
@@ -122,7 +123,7 @@ def test_columns_are_added_and_taken_away_again(kind: str) -> None:
             assert np.array_equal(more.attributes[name], values), name
     assert more.source.payloads() == scan.source.payloads()
     groups = more.source.root.find("data3D", "vectorChild", "pointGroupingSchemes", "groupingByLine", "groups")
-    records = e57.Records.at(groups, more.source.container, "b.e57")
+    records = Records.at(groups, more.source.container, "b.e57")
     assert records.values("startPointIndex").tolist() == [0, 150]
     back = io.without(more, [name for name in more.attributes if name not in scan.attributes])
     assert list(back.attributes) == list(scan.attributes)
@@ -151,6 +152,8 @@ def test_poses_turn_and_shift_stations() -> None:
     turned = local @ np.array([[0.28, -0.96, 0], [0.96, 0.28, 0], [0, 0, 1]]).T + [100, 0, 0]  # 0.8 + 0.6 k
     assert np.abs(both.points[300:] - turned).max() < 1e-12
     assert both.source.attachments() == ["poses of stations"]
+    named = with_xml(io_samples.e57("double"), b"{station 0}", b"{station X}")
+    assert e57.read(named, "b.e57").source.payloads() != alone.source.payloads()
 
 
 def test_columns_and_rows_of_a_scan_from_elsewhere_come_back(tmp_path: Path) -> None:
@@ -235,11 +238,13 @@ DAMAGES = {
 }
 REPLACED = {
     "more points": (b'recordCount="300"', b'recordCount="900"', "claims 900 points and holds fewer"),
-    "fewer than none": (b'recordCount="300"', b'recordCount="-30"', "claims -30 points"),
+    "fewer than none": (b'recordCount="300"', b'recordCount="-30"', "is no number of them"),
     "no number": (b'recordCount="300"', b'recordCount="3x0"', "tells no fields"),
     "no place": (b'fileOffset = "48"', b'fileOffset = "4x"', "says not where"),
     "another place": (b'fileOffset = "48"', b'fileOffset = "40"', "names a section at byte 40"),
     "beyond the end": (b'fileOffset = "48"', b'fileOffset = "9999999"', "names a section at byte 9999999"),
+    "a place before the file": (b'fileOffset = "48"', b'fileOffset = "-99999999"', "says not where"),
+    "a number of other digits": (b'recordCount="300"', 'recordCount="８"'.encode(), "is no number of them"),
     "unknown type": (b"cartesianX type=\"Float\"", b"cartesianX type=\"Bloat\"", "tells no fields"),
     "no coordinates": (b"cartesianX", b"cartesianQ", "points have no coordinates"),
     "bounds the wrong way round": (b'minimum="-3"', b'minimum="3000"', "tells no fields"),
@@ -296,6 +301,115 @@ def test_xml_deeper_or_longer_than_any_is_refused() -> None:
     for more, message in ((b"<a>" * 90 + b"</a>" * 90, "more or deeper"), (b"<a/>" * (1 << 20), "more or deeper")):
         said = io_samples.refusal(e57.read, with_xml(raw, b"</e57Root>", more + b"</e57Root>"), "a.e57")
         assert message in said
+
+
+@pytest.mark.parametrize("n_constant", [3, 120])
+def test_values_that_take_no_place_do_not_fill_the_memory(n_constant: int) -> None:
+    n, layout = 8000, e57_file.Layout()
+    fields = [Field(f"cartesian{axis}", "integer", 0, 1) for axis in "XYZ"]
+    fields += [Field(f"a{i}", "integer", 2**62, 2**62) for i in range(n_constant)]
+    at = layout.add_vector(fields, [field.packed(np.full(n, field.low)) for field in fields], n)
+    prototype = "".join(f'<{field.name} type="Integer" minimum="{field.low}" maximum="{field.high}"/>' for field in fields)
+    points = f'<points type="CompressedVector" fileOffset="{at}" recordCount="{n}"><prototype>{prototype}</prototype></points>'
+    raw = e57_file.closed(layout.data, f"<e57Root><data3D><vectorChild>{points}</vectorChild></data3D></e57Root>".encode())
+    if n_constant == 3:
+        assert len(e57.read(raw, "a.e57")) == n
+    else:
+        assert "claims 8000 points and holds fewer" in io_samples.refusal(e57.read, raw, "a.e57")
+
+
+def test_an_image_named_many_times_is_held_once() -> None:
+    raw = io_samples.e57("single", n=10, image=bytes(100_000))
+    logical = io_samples.e57_logical(raw)
+    start, stop = logical.index(b"<visualReference"), logical.index(b"</vectorChild></images2D>")
+    scan = e57.read(with_xml(raw, logical[start:stop], 50 * logical[start:stop]), "a.e57")
+    assert len(scan.source.payloads()["images"]) == 100_016
+    more = written(scan.with_attributes(further=np.arange(10.0)))
+    assert len(more) < 150_000
+    assert e57.read(more, "b.e57").source.payloads()["images"] == scan.source.payloads()["images"]
+
+
+def test_whole_numbers_keep_every_digit_when_some_are_replaced() -> None:
+    scan = e57.read(io_samples.e57("single"), "a.e57")
+    wide = scan.attributes["who:wide"].copy()
+    assert np.abs(wide).max() > 2**61
+    wide[3] = 2**60 + 1
+    back = e57.read(written(scan.with_attributes(**{"who:wide": wide})), "b.e57")
+    assert (back.attributes["who:wide"] == wide).all()
+    unsigned = io.Scan(np.zeros((3, 3)), {"wide": np.array([0, 1, 2**32], np.int64)})
+    assert io.losses(e57.read(written(unsigned), "c.e57"), "e57") == []
+
+
+def test_bounds_of_angles_and_floats_keep_what_they_held() -> None:
+    scan = e57.read(io_samples.e57("spherical"), "a.e57")
+    before = scan.source.stations[0].records.measured("sphericalAzimuth")
+    turned = e57.read(written(scan.moved_to(scan.points * 1.0001)), "b.e57").source.stations[0].records
+    assert np.abs(turned.measured("sphericalAzimuth") - before).max() < 1e-12
+    scan = e57.read(io_samples.e57("double"), "a.e57")
+    low = scan.source.stations[0].records.prototype.children[0].attributes["minimum"]
+    points = scan.points.copy()
+    points[0, 0] = 99.5
+    after = e57.read(written(scan.moved_to(points)), "b.e57").source.stations[0].records.prototype.children[0].attributes
+    assert (after["minimum"], after["maximum"]) == (low, "99.5")
+
+
+def test_other_prefixes_stay_what_they_were() -> None:
+    raw = with_xml(io_samples.e57("single"), b"xmlns:who='urn:who'", b"xmlns:who='urn:who' xmlns:nor='urn:nor'")
+    scan = e57.read(raw, "a.e57")
+    assert b"xmlns:nor='urn:nor'" in e57.read(written(scan, provenance={"a": 1}), "b.e57").source.xml
+
+
+@pytest.mark.parametrize("with_structure", [False, True])
+def test_sections_that_are_no_points_are_moved_whole(with_structure: bool) -> None:
+    raw = io_samples.e57("single", groups=True, image=IMAGE)
+    if with_structure:
+        nested = b'<pointCount type="Integer" minimum="0" maximum="65535"/>'
+        raw = with_xml(raw, nested, nested + b'<cartesianBounds type="Structure"><xMinimum type="Float"/></cartesianBounds>')
+    scan = e57.read(raw, "a.e57")
+    more = e57.read(written(scan.with_attributes(further=np.arange(300.0))), "b.e57")
+    assert (more.attributes["further"] == np.arange(300)).all()
+    assert more.source.payloads() == scan.source.payloads()
+
+
+def low_level(path: Path, sizes: list[int]) -> None:
+    """A file of libE57Format's own low level: stations of so many points, each with a text."""
+    libe57 = pytest.importorskip("pye57").libe57
+    file = libe57.ImageFile(str(path), "w")
+    root, data = file.root(), libe57.VectorNode(file, True)
+    root.set("formatName", libe57.StringNode(file, "ASTM E57 3D Imaging Data File"))
+    root.set("guid", libe57.StringNode(file, "{file}"))
+    root.set("data3D", data)
+    for n in sizes:
+        station, prototype = libe57.StructureNode(file), libe57.StructureNode(file)
+        for axis in "XYZ":
+            prototype.set(f"cartesian{axis}", libe57.FloatNode(file, 0.0, libe57.E57_DOUBLE, -1e9, 1e9))
+        points = libe57.CompressedVectorNode(file, prototype, libe57.VectorNode(file, True))
+        station.set("guid", libe57.StringNode(file, "{station}"))
+        station.set("points", points)
+        data.append(station)
+        values = [np.arange(n, dtype=float) + i for i in range(3)]
+        buffers = libe57.VectorSourceDestBuffer()
+        for axis, some in zip("XYZ", values, strict=True):
+            buffers.append(libe57.SourceDestBuffer(file, f"cartesian{axis}", some if n else np.zeros(1), max(n, 1), True, True))
+        writer = points.writer(buffers)
+        if n:
+            writer.write(n)
+        writer.close()
+    file.close()
+
+
+def test_stations_without_points_are_read_from_libe57_and_by_it(tmp_path: Path) -> None:
+    pye57 = pytest.importorskip("pye57")
+    path, few = tmp_path / "in.e57", tmp_path / "few.e57"
+    low_level(path, [5, 0, 7])
+    scan = io.read(path)
+    assert scan.attributes["station"].tolist() == [0] * 5 + [2] * 7
+    assert written(scan) == path.read_bytes()
+    io.write(io.select(scan, np.arange(12) >= 5), few)
+    theirs = pye57.E57(str(few))
+    assert [theirs.get_header(number).point_count for number in range(3)] == [0, 0, 7]
+    assert theirs.read_scan_raw(2)["cartesianX"].tolist() == list(range(7))
+    theirs.close()
 
 
 @settings(max_examples=80, deadline=None, database=None)

@@ -48,7 +48,8 @@ def undo(
     """Take a cleaned scan back to the original, exactly; needs a scan written by denoise --displacement.
 
     The columns that it added and the note on how it was made go too: a LAS, binary PLY or binary PCD is the original byte for
-    byte. Compressed files and E57 hold the same and may be packed otherwise; a number in a text may gain zeros at its end.
+    byte. Compressed files and E57 hold the same and may be packed otherwise, and stations of an E57 that are turned are the same
+    to float64's last digits; a number in a text may gain zeros at its end.
 
     Example: pcdenoise undo clean.laz -o original.laz
     """

@@ -21,14 +21,18 @@ from pcdenoise.errors import ScanError
 from pcdenoise.io import e57_file
 from pcdenoise.io.e57_file import Container, Field, Layout
 from pcdenoise.io.e57_new import NAMES, NAMESPACES, OURS, PROVENANCE, added, created, described, storable
-from pcdenoise.io.e57_stations import BOUNDS, CARTESIAN, SPHERICAL, Records, Station, offset, prototype, stations_of
+from pcdenoise.io.e57_stations import AXES_OF_BOUNDS, AZIMUTH, BOUNDS, CARTESIAN, SPHERICAL, Station, offset, stations_of
 from pcdenoise.io.e57_xml import Edits, Element, a_text, parsed
 from pcdenoise.io.source import STATION, Column, changed, free_name, moved_rows
+
+_NOTES = "names and notes"
+_SECTIONS = ("Blob", "CompressedVector")
+"""Types of elements that name a section of the file."""
 
 
 @dataclass(frozen=True)
 class E57Source:
-    """An E57 file: its bytes, their container, the root of its XML and its stations; labels: the field of each attribute."""
+    """An E57 file: its bytes, their container, the root of its XML, its stations; labels: attribute name -> name of its field."""
 
     raw: bytes
     container: Container
@@ -53,22 +57,36 @@ class E57Source:
 
     @property
     def has_steps(self) -> bool:
-        """Whether coordinates are whole numbers of steps, not floats."""
-        return any(field.kind in ("integer", "scaled") for station in self.stations for field in station.coordinates)
+        """Whether all world coordinates are whole numbers of steps: no floats, no angles, no poses."""
+        return all(
+            station.systems[0] == CARTESIAN and not station.is_placed and field.kind in ("integer", "scaled")
+            for station in self.stations
+            for field in station.coordinates
+        )
 
     def attachments(self) -> list[str]:
-        """Images, poses and metadata of the coordinates."""
-        return list(self.payloads())
+        """Images, poses, metadata of the coordinates, texts of points; not notes, which only say where a file comes from."""
+        return [name for name in self.payloads() if name != _NOTES]
 
     def payloads(self) -> dict[str, bytes]:
-        """The bytes of all images; poses and metadata as the XML says them."""
-        blobs = [element for element in self.root.all() if element.attributes.get("type") == "Blob"]
+        """The bytes of all images and of texts of points; poses, metadata and all other texts as the XML says them."""
+        kinds = {element: element.attributes.get("type") for element in self.root.all()}
+        blobs = {offset(element, self.origin): None for element, kind in kinds.items() if kind == "Blob"}
+        notes = [element.text for element, kind in kinds.items() if kind == "String" and element.name != PROVENANCE]
         places = [json.dumps([station.rotation.tolist(), station.translation.tolist()]) for station in self.stations]
+        texts = [
+            stream
+            for records in (station.records for station in self.stations)
+            for field, stream in zip(records.fields, records.streams, strict=True)
+            if field.kind == "text"
+        ]
         metadata = self.root.find("coordinateMetadata")
         found = {
-            "images": b"".join(e57_file.blob_at(self.container, offset(blob, self.origin), self.origin) for blob in blobs),
+            "images": b"".join(e57_file.section_at(self.container, blob, self.origin) for blob in blobs),
             "poses of stations": "\n".join(places).encode() if any(station.is_placed for station in self.stations) else b"",
             "coordinate metadata": b"" if metadata is None else metadata.text.strip().encode(),
+            "texts of points": b"".join(texts),
+            _NOTES: "\0".join(notes).encode(),
         }
         return {name: data for name, data in found.items() if data}
 
@@ -80,7 +98,7 @@ class E57Source:
             for number in reversed(range(len(part.fields))):
                 if part.fields[number].name in gone:
                     del part.fields[number], part.streams[number]
-            for child in prototype(station.records.element).children:
+            for child in station.records.prototype.children:
                 if child.name in gone:
                     edits.remove(child)
             parts.append(part)
@@ -144,8 +162,9 @@ def read(raw: bytes, origin: str) -> Scan:
     container = e57_file.opened(raw, origin)
     root = parsed(container.data[container.xml].tobytes(), origin)
     stations = list(stations_of(container, root, origin))
-    if sum(station.records.size for station in stations) > len(raw):
-        raise ScanError(f"{origin}: several stations claim the same points; it is damaged, fetch it again")
+    for element in root.all():
+        if element.attributes.get("type") in _SECTIONS:
+            offset(element, origin)
     source = E57Source(raw, container, root, stations, {}, {}, origin)
     own = {*CARTESIAN, *SPHERICAL}
     names = dict.fromkeys(f.name for s in stations for f in s.records.fields if f.name not in own and f.kind != "text")
@@ -186,14 +205,14 @@ def write(scan: Scan, file: BinaryIO, *, provenance: Mapping[str, Any] | None = 
         if moved[rows].any():
             _move(station, part, edits, scan.points[rows], moved[rows])
         for name, values in columns.items():
-            number = station.records.number(source.labels.get(name, ""))
+            number = station.records.index_of(source.labels.get(name, ""))
             if number is not None:
                 part.put(number, _as_stored(part.fields[number], values[rows]))
         further = added({name: values[rows] for name, values in new.items()}, [field.name for field in part.fields])
         for field, stream in further:
             part.fields.append(field)
             part.streams.append(stream)
-            edits.append(prototype(station.records.element), described(field))
+            edits.append(station.records.prototype, described(field))
         _widen(station, part, edits)
         parts.append(part)
     if provenance is not None:
@@ -202,7 +221,8 @@ def write(scan: Scan, file: BinaryIO, *, provenance: Mapping[str, Any] | None = 
         edits.append(source.root, a_text(PROVENANCE, json.dumps(provenance)))
     if new or provenance is not None:
         used = {field.name.partition(":")[0] for part in parts for field in part.fields} | {"pcdenoise"}
-        edits.set(source.root, **{f"xmlns:{short}": name for short, name in NAMESPACES.items() if short in used})
+        spaces = {f"xmlns:{short}": name for short, name in NAMESPACES.items() if short in used}
+        edits.set(source.root, **{name: space for name, space in spaces.items() if name not in source.root.attributes})
     file.write(_assembled(source, parts, edits))
 
 
@@ -220,8 +240,13 @@ def _as_stored(field: Field, values: Column) -> Column:
     """(n,) values as a field stores them: the nearest that it has. Raises ScanError where an integer is no number."""
     if field.kind in ("single", "double"):
         return values.astype(np.float32 if field.kind == "single" else np.float64)
-    steps = np.rint((values - field.offset) / field.scale) if field.kind == "scaled" else np.rint(values)
-    if not np.isfinite(steps).all() or (np.abs(steps) > 2.0**62).any():
+    if values.dtype.kind in "iub" and field.kind == "integer":
+        steps = values
+        fits = not len(values) or int(values.max()) < 2**63
+    else:
+        steps = np.rint((values.astype(np.float64) - field.offset) / field.scale)
+        fits = bool((np.abs(steps) < 2.0**62).all())  # NaN is not
+    if not fits:
         raise ScanError(f"{field.name} holds whole numbers, which the new values are not; write .las or .ply instead")
     return steps.astype(np.int64)
 
@@ -231,32 +256,42 @@ def _move(station: Station, part: _Part, edits: Edits, points: Points, moved: Ma
     for system in station.systems:
         new = station.from_world(points[moved], system)
         for axis, name in enumerate(system):
-            number, values = station.records.number(name), station.records.values(name)
+            number, values, before = station.records.index_of(name), station.records.values(name), station.records.measured(name)
             assert number is not None
             assert values is not None
+            assert before is not None
+            if name == AZIMUTH:  # from 0 to 2 π, or from -π on: as the file counts
+                new[:, axis] += 2 * np.pi * np.rint((before[moved] - new[:, axis]) / (2 * np.pi))
             stored = _as_stored(part.fields[number], new[:, axis])
             values = values.astype(stored.dtype)
             values[moved] = stored
             part.put(number, values)
-        bounds = station.element.find("cartesianBounds") if system == CARTESIAN else None
-        ends = np.stack([new.min(axis=0), new.max(axis=0)], axis=1).reshape(-1)
-        for name, end in zip(BOUNDS, ends, strict=True):
-            element = bounds.find(name) if bounds is not None else None
-            before = element.number() if element is not None else end
-            if element is not None and (end > before if name.endswith("Maximum") else end < before):
-                edits.put(element, float(end))
+    for bounds, system in BOUNDS.items():
+        element = station.element.find(bounds)
+        if element is not None:
+            _stretch(element, station.from_world(points[moved], system), AXES_OF_BOUNDS[bounds], edits)
+
+
+def _stretch(bounds: Element, points: Points, axes: Sequence[str], edits: Edits) -> None:
+    """Moves bounds of a station's coordinates outward, those that are there, to where (m, 3) points are."""
+    for name, values in zip(axes, points.T, strict=True):
+        for end, value, sign in ((name + "Minimum", values.min(), -1), (name + "Maximum", values.max(), 1)):
+            element = bounds.find(end)
+            if element is not None and sign * value > sign * element.number():
+                edits.put(element, float(value))
 
 
 def _widen(station: Station, part: _Part, edits: Edits) -> None:
     """Says in the XML between what bounds the fields that were there lie now."""
-    for child, before, field in zip(
-        prototype(station.records.element).children, station.records.fields, part.fields, strict=False
-    ):
-        low, high = part.ends.get(field.name, (np.inf, -np.inf))
+    for child, before, field in zip(station.records.prototype.children, station.records.fields, part.fields, strict=False):
         if (field.low, field.high) != (before.low, before.high):
             edits.set(child, minimum=str(field.low), maximum=str(field.high))
-        elif low < float(child.attributes.get("minimum", "-inf")) or high > float(child.attributes.get("maximum", "inf")):
-            edits.set(child, minimum=repr(low), maximum=repr(high))
+        elif field.name in part.ends:
+            said, (low, high) = child.attributes, part.ends[field.name]
+            wider = {"minimum": low} if low < float(said.get("minimum", "-inf")) else {}
+            wider |= {"maximum": high} if high > float(said.get("maximum", "inf")) else {}
+            if wider:
+                edits.set(child, **{name: repr(end) for name, end in wider.items()})
 
 
 def _assembled(source: E57Source, parts: Sequence[_Part], edits: Edits, are_grouped: bool = True) -> bytes:
@@ -273,23 +308,19 @@ def _assembled(source: E57Source, parts: Sequence[_Part], edits: Edits, are_grou
         end = container.xml.start if not data[container.xml.stop :].any() else len(data)
         return e57_file.closed(data[:end].tobytes(), edits.made(), container.page)
     layout = Layout()
-    by_element = {id(station.records.element): part for station, part in pairs}
-    gone = [] if are_grouped else [s.element.find("pointGroupingSchemes") for s in source.stations]
-    skipped = {id(inner) for element in gone if element is not None for inner in element.all()}
+    by_element = {station.records.element: part for station, part in pairs}
+    gone = [] if are_grouped else [station.element.find("pointGroupingSchemes") for station in source.stations]
+    skipped = {inner for element in gone if element is not None for inner in element.all()}
+    placed: dict[int, int] = {}
     for element in source.root.all():
-        kind = element.attributes.get("type")
-        if kind not in ("Blob", "CompressedVector") or id(element) in skipped:
-            continue
-        if kind == "Blob":
-            at = layout.add_blob(e57_file.blob_at(container, offset(element, source.origin), source.origin))
-            edits.set(element, fileOffset=str(at))
-        elif id(element) in by_element:
-            new = by_element[id(element)]
+        if element in by_element:
+            new = by_element[element]
             at = layout.add_vector(new.fields, new.streams, new.n)
             edits.set(element, fileOffset=str(at), recordCount=str(new.n))
-        else:
-            records = Records.at(element, container, source.origin)
-            edits.set(element, fileOffset=str(layout.add_vector(records.fields, records.streams, records.n)))
+        elif element.attributes.get("type") in _SECTIONS and element not in skipped:
+            before = offset(element, source.origin)
+            placed[before] = placed.get(before) or layout.add_section(container, before, source.origin)
+            edits.set(element, fileOffset=str(placed[before]))
     return e57_file.closed(layout.data, edits.made())
 
 

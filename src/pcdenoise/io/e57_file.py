@@ -8,6 +8,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -30,8 +31,9 @@ _RECORDS = struct.Struct("<B7xQQQ")  # of one with records also where its data s
 _PACKET = struct.Struct("<BBHH")  # what it is, flags, its length less one, number of streams
 _INDEX_PACKET, _DATA_PACKET, _EMPTY_PACKET = 0, 1, 2
 _INDEX = struct.Struct("<BBHHB9xQQ")  # of one entry: from which record on, and where that is
-_LONGEST_PACKET = 1 << 16
-_SMALLEST_PAGE, _LARGEST_PAGE = 64, 1 << 20
+_INDEX_HEAD = 16
+_USUAL_PACKET = 1 << 15  # bytes of values; none may have twice that, and eight records of all fields are a quarter of it at most
+_SMALLEST_PAGE, _LARGEST_PAGE = 64, 1 << 16
 _CHECKSUM_BYTES, _PAGES_AT_ONCE = 4, 4096
 _RECORDS_AT_ONCE = 1 << 16
 _WHOLE_WORDS = {8: "<u1", 16: "<u2", 32: "<u4", 64: "<u8"}
@@ -59,7 +61,7 @@ class Field:
         if self.kind in ("single", "double"):
             return np.frombuffer(stream, "<f4" if self.kind == "single" else "<f8", n)
         narrow = np.result_type(np.min_scalar_type(self.low), np.min_scalar_type(self.high))
-        dtype = narrow if narrow.kind in "iu" else np.dtype(np.int64)
+        dtype = narrow if narrow.kind in "iu" and narrow != np.uint64 else np.dtype(np.int64)
         values = _unpacked(stream, self.bits, n) + np.uint64(self.low % (1 << 64))  # goes around, as two's complement does
         return values.view(np.int64).astype(dtype)
 
@@ -184,29 +186,30 @@ def _checksums(pages: Octets) -> NDArray[np.uint32]:
 
 @dataclass(frozen=True)
 class Vector:
-    """A section of records: where the pieces of each field's stream stand in the container's data."""
+    """A section of records: where the pieces of each field's stream stand in the container's data, and its length."""
 
     pieces: Sequence[Sequence[slice]]
+    length: int
 
     def stream(self, container: Container, number: int) -> bytes:
         """All bytes of a field's stream."""
         return b"".join(container.data[piece].tobytes() for piece in self.pieces[number])
 
 
-def vector_at(container: Container, physical: int, n_fields: int, origin: str) -> Vector:
-    """The section of records at an offset of the file. Raises ScanError on damage."""
+def vector_at(container: Container, physical: int, n_fields: int, is_empty: bool, origin: str) -> Vector:
+    """The section of records at an offset of the file, which may be empty: without packets. Raises ScanError on damage."""
     data, start = container.data, container.at(physical)
     if start + _RECORDS.size > len(data):
         raise _no_section(origin, physical)
-    kind, length, data_at, _ = _RECORDS.unpack_from(data.data, start)
-    at, stop = container.at(data_at), start + length
-    if kind != _VECTOR or stop > len(data) or not start < at <= stop:
-        raise _no_section(origin, physical)
+    kind, section_length, data_at, _ = _RECORDS.unpack_from(data.data, start)
+    at, stop = container.at(data_at), start + section_length
     pieces: list[list[slice]] = [[] for _ in range(n_fields)]
-    while at < stop:
+    if kind != _VECTOR or stop > len(data) or not (is_empty or start < at <= stop):
+        raise _no_section(origin, physical)
+    while at < stop and not is_empty:
         kind, _, length, n_streams = _PACKET.unpack_from(data.data, at) if at + _PACKET.size <= stop else (-1, 0, 0, 0)
         end = at + length + 1
-        if kind not in (_INDEX_PACKET, _DATA_PACKET, _EMPTY_PACKET) or end > stop:
+        if kind not in (_INDEX_PACKET, _DATA_PACKET, _EMPTY_PACKET) or end > stop or end % 4 != at % 4:
             raise ScanError(f"{origin}: has a broken packet in its points at byte {at}; it is damaged, fetch it again")
         if kind == _DATA_PACKET:
             first = at + _PACKET.size + 2 * n_streams
@@ -217,18 +220,18 @@ def vector_at(container: Container, physical: int, n_fields: int, origin: str) -
                 piece.append(slice(first, first + size))
                 first += size
         at = end
-    return Vector(pieces)
+    return Vector(pieces, section_length)
 
 
 def _no_section(origin: str, physical: int) -> ScanError:
     return ScanError(f"{origin}: its XML names a section at byte {physical}, where none is; it is damaged, fetch it again")
 
 
-def blob_at(container: Container, physical: int, origin: str) -> bytes:
-    """A section that holds an image or the like, with its head. Raises ScanError on damage."""
+def section_at(container: Container, physical: int, origin: str) -> bytes:
+    """The bytes of a section, its head among them: of records, or of an image or the like. Raises ScanError on damage."""
     data, start = container.data, container.at(physical)
     kind, length = _SECTION.unpack_from(data.data, start) if start + _SECTION.size <= len(data) else (-1, 0)
-    if kind != _BLOB or start + length > len(data):
+    if kind not in (_BLOB, _VECTOR) or length < (_SECTION if kind == _BLOB else _RECORDS).size or start + length > len(data):
         raise _no_section(origin, physical)
     return data[start : start + length].tobytes()
 
@@ -244,11 +247,27 @@ class Layout:
         """What there is by now."""
         return bytes(self._data)
 
-    def add_blob(self, section: bytes) -> int:
-        """Puts a section down as it is, and says where in the file it lies."""
-        at = self._next()
+    def add_section(self, container: Container, physical: int, origin: str) -> int:
+        """Puts a section of another file down as it is, and says where it lies; what in it names places is told the new ones."""
+        section, at = bytearray(section_at(container, physical, origin)), self._next()
+        start, where = container.at(physical), _physical(at, PAGE)
+
+        def moved(place: int) -> int:
+            return _physical(container.at(place) - start + at, PAGE) if place else 0
+
+        if section[0] == _VECTOR:
+            kind, length, data_at, index_at = _RECORDS.unpack_from(section)
+            _RECORDS.pack_into(section, 0, kind, length, moved(data_at), moved(index_at))
+            inside = _RECORDS.size
+            while inside + _PACKET.size <= len(section):
+                kind, _, length, n_entries = _PACKET.unpack_from(section, inside)
+                stop = min(inside + length + 1, len(section))
+                for entry in range(inside + _INDEX_HEAD, stop - 15, 16) if kind == _INDEX_PACKET else ():
+                    if (entry - inside - _INDEX_HEAD) // 16 < n_entries:
+                        struct.pack_into("<Q", section, entry + 8, moved(struct.unpack_from("<Q", section, entry + 8)[0]))
+                inside = stop
         self._data += section
-        return _physical(at, PAGE)
+        return where
 
     def add_vector(self, fields: Sequence[Field], streams: Sequence[bytes], n: int) -> int:
         """Puts n records down, and says where in the file their section lies."""
@@ -268,24 +287,16 @@ class Layout:
 
 
 def _data_packets(fields: Sequence[Field], streams: Sequence[bytes], n: int) -> Iterator[bytes]:
-    """Packets of as many records each, a multiple of eight, so that no byte of a stream is shared by two."""
-    room = (_LONGEST_PACKET - _PACKET.size - 2 * len(fields) - 4) // 2
-    bits = sum(
-        field.bits if field.kind != "text" else -(-8 * len(some) // max(n, 1))
-        for field, some in zip(fields, streams, strict=True)
-    )
-    n_records = max(8, 8 * room // max(bits, 1) // 8 * 8)
-    n_packets = -(-n // n_records)
-    for number in range(n_packets):
+    """Packets of about as many records each, a multiple of eight, so that no byte of a stream is shared by two; one at least."""
+    n_packets = max(1, -(-sum(map(len, streams)) // _USUAL_PACKET))
+    records = [min(n, -(-n * number // n_packets // 8) * 8) for number in range(n_packets + 1)]
+    for number, (first, last) in enumerate(pairwise(records)):
         parts = []
         for field, some in zip(fields, streams, strict=True):
-            if field.kind == "text":
-                cuts = len(some) * number // n_packets, len(some) * (number + 1) // n_packets
-            else:
-                cuts = number * n_records * field.bits // 8, (number + 1) * n_records * field.bits // 8
-            parts.append(some[slice(*cuts)] if number + 1 < n_packets else some[cuts[0] :])
-        sizes = np.array([len(part) for part in parts], "<u2").tobytes()
-        body = sizes + b"".join(parts)
+            by_record = bytes_of(field, first), bytes_of(field, last)
+            by_length = len(some) * number // n_packets, len(some) * (number + 1) // n_packets
+            parts.append(some[slice(*(by_length if field.kind == "text" else by_record))])
+        body = np.array([len(part) for part in parts], "<u2").tobytes() + b"".join(parts)
         body += bytes(-(_PACKET.size + len(body)) % 4)
         yield _PACKET.pack(_DATA_PACKET, 0, _PACKET.size + len(body) - 1, len(parts)) + body
 

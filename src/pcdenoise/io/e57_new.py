@@ -18,7 +18,7 @@ import numpy as np
 from pcdenoise.cloud.scan import Scan
 from pcdenoise.io import e57_file
 from pcdenoise.io.e57_file import Field, Layout
-from pcdenoise.io.e57_stations import BOUNDS, CARTESIAN, INVALID
+from pcdenoise.io.e57_stations import AXES_OF_BOUNDS, CARTESIAN, INVALID
 from pcdenoise.io.e57_xml import a_number, a_text
 from pcdenoise.io.source import Column, colours_as_bytes, free_name, is_number, narrowest_float, portable
 
@@ -32,7 +32,9 @@ NAMESPACES = {"pcdenoise": OUR_NAMESPACE, "nor": "http://www.libe57.org/E57_NOR_
 """Of fields that the standard does not know, by their prefix."""
 PROVENANCE = OURS + "provenance"
 
-_FIELDS = {name: field for field, name in NAMES.items()} | {"intensity": "intensity"}
+_STANDARD = ("intensity", "rowIndex", "columnIndex", "returnIndex", "returnCount", "timeStamp", "isTimeStampInvalid",
+             "isIntensityInvalid", "isColorInvalid", *INVALID.values())  # fmt: skip
+_FIELDS = {name: field for field, name in NAMES.items()} | {name: name for name in _STANDARD}
 
 
 def storable(columns: Mapping[str, Column]) -> dict[str, Column]:
@@ -69,18 +71,21 @@ def created(scan: Scan, provenance: Mapping[str, Any] | None) -> bytes:
         state = Field(INVALID[CARTESIAN], "integer", 0, 2)
         table.append((state, state.packed(np.where(scan.finite, 0, 2))))
     columns = storable(colours_as_bytes(portable(scan.attributes)))
+    columns = {name: values for name, values in columns.items() if name not in [field.name for field, _ in table]}
     table += added(columns, [field.name for field, _ in table])
     layout = Layout()
     at = layout.add_vector([field for field, _ in table], [stream for _, stream in table], len(scan))
-    known = scan.points[scan.finite]
-    ends = np.stack([known.min(axis=0), known.max(axis=0)], axis=1).reshape(-1) if len(known) else np.zeros(6)
+    known = scan.points[scan.finite] if scan.finite.any() else np.zeros((1, 3))
+    ends = [(axis, values) for axis, values in zip(AXES_OF_BOUNDS["cartesianBounds"], known.T, strict=True)]
     limits = "".join(
         _limits(group, {field: columns[name] for name, field in _FIELDS.items() if name in columns and field.startswith(group)})
         for group in ("intensity", "color")
     )
     spaces = "".join(f' xmlns:{short}="{name}"' for short, name in NAMESPACES.items())
     prototype = "".join(described(field) for field, _ in table)
-    bounds = "".join(a_number(name, float(end)) for name, end in zip(BOUNDS, ends, strict=True))
+    bounds = "".join(
+        a_number(axis + "Minimum", float(values.min())) + a_number(axis + "Maximum", float(values.max())) for axis, values in ends
+    )
     made_by = "" if provenance is None else a_text(PROVENANCE, json.dumps(provenance))
     digest = hashlib.sha256(layout.data).hexdigest()
     file_id, station_id = (

@@ -23,12 +23,17 @@ SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 INVALID: dict[tuple[str, ...], str] = {CARTESIAN: "cartesianInvalidState", SPHERICAL: "sphericalInvalidState"}
 """The fields that say whether a record is a measurement: 0 if it is."""
 
-BOUNDS = [axis + end for axis in "xyz" for end in ("Minimum", "Maximum")]
-"""What a station says of the box that its Cartesian coordinates lie in."""
+AZIMUTH = SPHERICAL[1]
+BOUNDS = {"cartesianBounds": CARTESIAN, "sphericalBounds": SPHERICAL}
+"""What a station says of where its points lie, and in what coordinates."""
+AXES_OF_BOUNDS = {"cartesianBounds": ("x", "y", "z"), "sphericalBounds": ("range", "azimuth", "elevation")}
+"""The azimuths of a sphere have a start and an end, no minimum."""
 
 _TYPES = {"Float": "double", "Integer": "integer", "ScaledInteger": "scaled", "String": "text"}
 _LEAST, _MOST = -(2**63), 2**63 - 1
-_MOST_FIELDS = 256
+_MOST_FIELDS, _FEW_VALUES, _MOST_VALUES_PER_BYTE = 256, 4096, 16
+"""Fields that have one value alone take no place in the file: beyond a few, so many values at most for each byte there is."""
+_LONGEST_FAULT = 60
 
 
 @dataclass(frozen=True)
@@ -46,16 +51,25 @@ class Records:
         """The records that an element names. Raises ScanError on damage, and where there are fewer than it claims."""
         try:
             fields = [_field(child) for child in prototype(element).children]
-            n = int(element.attributes["recordCount"])
+            n = _whole(element.attributes["recordCount"])
         except (KeyError, ValueError) as fault:
-            raise ScanError(f"{origin}: its XML tells no fields of its points ({fault}); it is damaged, fetch it again") from None
-        if n < 0 or len(fields) > _MOST_FIELDS or len({field.name for field in fields}) < len(fields):
+            said = str(fault)[:_LONGEST_FAULT]
+            raise ScanError(f"{origin}: its XML tells no fields of its points ({said}); it is damaged, fetch it again") from None
+        if len(fields) > _MOST_FIELDS or len({field.name for field in fields}) < len(fields):
             raise ScanError(f"{origin}: its XML claims {n} points of {len(fields)} fields; it is damaged, fetch it again")
-        vector = e57_file.vector_at(container, offset(element, origin), len(fields), origin)
+        needed = [e57_file.bytes_of(field, n) for field in fields]
+        is_empty = n == 0 or not (any(needed) or any(field.kind == "text" for field in fields))
+        vector = e57_file.vector_at(container, offset(element, origin), len(fields), is_empty, origin)
         sizes = [sum(piece.stop - piece.start for piece in some) for some in vector.pieces]
-        if any(size < e57_file.bytes_of(field, n) for field, size in zip(fields, sizes, strict=True)) or n > 8 * sum(sizes):
+        too_few = any(size < least for size, least in zip(sizes, needed, strict=True))
+        if too_few or n * len(fields) > max(_FEW_VALUES, _MOST_VALUES_PER_BYTE * sum(sizes)):
             raise ScanError(f"{origin}: claims {n} points and holds fewer; it is cut off or damaged, fetch it again")
         return cls(element, fields, n, container, vector)
+
+    @property
+    def prototype(self) -> Element:
+        """The element that names the fields."""
+        return prototype(self.element)
 
     @property
     def size(self) -> int:
@@ -64,26 +78,29 @@ class Records:
 
     @property
     def streams(self) -> list[bytes]:
-        """The stream of each field."""
-        return [self.vector.stream(self.container, number) for number in range(len(self.fields))]
+        """The stream of each field, without what stands behind its last value."""
+        whole = [self.vector.stream(self.container, number) for number in range(len(self.fields))]
+        pairs = zip(self.fields, whole, strict=True)
+        return [some if field.kind == "text" else some[: e57_file.bytes_of(field, self.n)] for field, some in pairs]
 
-    def number(self, name: str) -> int | None:
+    def index_of(self, name: str) -> int | None:
         """The number of the field of that name."""
         return next((i for i, field in enumerate(self.fields) if field.name == name), None)
 
     def values(self, name: str) -> Column | None:
         """(n,) values of a field as stored, None where there is no such field."""
-        number = self.number(name)
+        number = self.index_of(name)
         if number is None:
             return None
         return self.fields[number].unpacked(self.vector.stream(self.container, number), self.n)
 
     def measured(self, name: str) -> Column | None:
         """(n,) values of a field in its unit: scaled integers are float64 then."""
-        values, number = self.values(name), self.number(name)
+        values, number = self.values(name), self.index_of(name)
         if values is None or number is None or self.fields[number].kind != "scaled":
             return values
-        return values * self.fields[number].scale + self.fields[number].offset
+        with np.errstate(over="ignore", invalid="ignore"):  # by a scale that no scanner has
+            return values * self.fields[number].scale + self.fields[number].offset
 
 
 @dataclass(frozen=True)
@@ -155,15 +172,19 @@ class Station:
 
 def stations_of(container: Container, root: Element, origin: str) -> Iterator[Station]:
     """The stations that have points, in order. Raises ScanError on damage, and where points have no coordinates."""
-    data, at = root.find("data3D"), 0
+    data, at, claimed = root.find("data3D"), 0, 0
     for element in data.children if data is not None else []:
         points = element.find("points")
         if points is None:
             continue
         records = Records.at(points, container, origin)
+        claimed += records.vector.length
+        if claimed > len(container.data):
+            raise ScanError(f"{origin}: several stations claim the same points; it is damaged, fetch it again")
         try:
             station = Station(element, records, slice(at, at + records.n), *_pose(element.find("pose")))
-            _ = [element.number("cartesianBounds", name) for name in BOUNDS]
+            for bounds in filter(None, map(element.find, BOUNDS)):
+                _ = [end.number() for end in bounds.children]
         except ValueError:
             raise ScanError(f"{origin}: poses or bounds are no numbers; it is damaged, fetch it again") from None
         if not station.systems or any(field.kind == "text" for field in station.coordinates):
@@ -184,9 +205,16 @@ def prototype(points: Element) -> Element:
 def offset(element: Element, origin: str) -> int:
     """Where in the file the section is that an element names. Raises ScanError where it says none."""
     try:
-        return int(element.attributes["fileOffset"])
+        return _whole(element.attributes["fileOffset"])
     except (KeyError, ValueError):
         raise ScanError(f"{origin}: its XML says not where {element.name} is; it is damaged, fetch it again") from None
+
+
+def _whole(text: str) -> int:
+    """A number of places or records. Raises ValueError for anything else."""
+    if not (text.isascii() and text.isdigit() and len(text) < 20):
+        raise ValueError(f"{text[:_LONGEST_FAULT]!r} is no number of them")
+    return int(text)
 
 
 def _field(element: Element) -> Field:
@@ -212,7 +240,7 @@ def _pose(element: Element | None) -> tuple[NDArray[np.float64], NDArray[np.floa
         return np.eye(3), np.zeros(3)
     translation = np.array([element.number("translation", axis) for axis in "xyz"])
     w, *v = (element.number("rotation", axis, default=float(axis == "w")) for axis in "wxyz")
-    length = float(np.sqrt(w * w + np.dot(v, v)))
+    length = float(np.hypot(w, np.hypot(v[0], np.hypot(v[1], v[2]))))
     if not (length > 0 and np.isfinite(length) and np.isfinite(translation).all()):
         raise ValueError("no rotation")
     w, (x, y, z) = w / length, np.array(v) / length

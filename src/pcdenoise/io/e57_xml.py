@@ -17,7 +17,7 @@ _LONGEST, _MOST_ELEMENTS, _DEEPEST = 1 << 26, 1 << 20, 64
 _START_TAG = re.compile(rb"<[^\s/>]+(?:\s+[^\s=/>]+\s*=\s*(?:\"[^\"]*\"|'[^']*'))*\s*")
 
 
-@dataclass
+@dataclass(eq=False)
 class Element:
     """An element, and the bytes from its first to behind its last; text: all that stands in it outside other elements."""
 
@@ -56,7 +56,7 @@ def parsed(xml: bytes, origin: str) -> Element:
     parser = expat.ParserCreate("utf-8")
     parser.buffer_text = True
     outermost = Element("", {}, 0)
-    inside = [outermost]
+    inside, texts = [outermost], [list[str]()]
     n_elements = 0
 
     def begin(name: str, attributes: dict[str, str]) -> None:
@@ -67,14 +67,16 @@ def parsed(xml: bytes, origin: str) -> Element:
         element = Element(name, attributes, parser.CurrentByteIndex)
         inside[-1].children.append(element)
         inside.append(element)
+        texts.append([])
 
     def end(_name: str) -> None:
-        element, at = inside.pop(), parser.CurrentByteIndex
+        element, at = inside.pop(), parser.CurrentByteIndex  # where </name> starts, or what is behind <name/>
+        element.text = "".join(texts.pop())
         is_one_tag = not element.children and not element.text and xml[at - 2 : at] == b"/>"
         element.stop = at if is_one_tag else xml.index(b">", at) + 1
 
     def say(text: str) -> None:
-        inside[-1].text += text
+        texts[-1].append(text)
 
     def refuse(*_declaration: object) -> None:
         raise ScanError(f"{origin}: its XML declares a document type, which E57 has not; it is not to be trusted")
@@ -99,7 +101,7 @@ class Edits:
         tag = self._tag(element)
         for name, value in attributes.items():
             said = f"{name}={_quoted(value)}".encode()
-            tag, n = re.subn(rb"\b" + name.encode() + rb"\s*=\s*(?:\"[^\"]*\"|'[^']*')", lambda _: said, tag, count=1)  # noqa: B023
+            tag, n = re.subn(rb"(?<=\s)" + name.encode() + rb"\s*=\s*(?:\"[^\"]*\"|'[^']*')", lambda _: said, tag, count=1)  # noqa: B023
             tag = tag if n else tag.rstrip() + b" " + said
         self._changes[element.start, element.start + len(self._tag(element))] = tag
 
