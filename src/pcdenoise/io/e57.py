@@ -164,7 +164,7 @@ def read(raw: bytes, origin: str) -> Scan:
     stations = list(stations_of(container, root, origin))
     for element in root.all():
         if element.attributes.get("type") in _SECTIONS:
-            offset(element, origin)
+            offset(element, origin)  # a fault is told now, not when the scan has been cleaned
     source = E57Source(raw, container, root, stations, {}, {}, origin)
     own = {*CARTESIAN, *SPHERICAL}
     names = dict.fromkeys(f.name for s in stations for f in s.records.fields if f.name not in own and f.kind != "text")

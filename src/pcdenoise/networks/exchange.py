@@ -50,7 +50,7 @@ def exchange(
     second (C, C) and head (3, C) the layers. No gradient reaches `weight`.
     """
     learning = torch.is_grad_enabled()  # not known inside
-    made = _Compiled if _is_compiled(features, own) else _Exchange
+    made = _Compiled if _is_compiled(features, own) else _InTorch
     nothing = (own.new_zeros(0, own.shape[1]), own.new_zeros(0))
     mean, most, known = made.apply(  # type: ignore[no-untyped-call]
         learning, features, own, heard, source, weight, *first, *second, *(head or nothing)
@@ -117,7 +117,7 @@ def _at(tensor: Tensor | None) -> int:
     return 0 if tensor is None or not tensor.numel() else tensor.data_ptr()
 
 
-class _Exchange(torch.autograd.Function):
+class _InTorch(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, learning: bool, features: Tensor, own: Tensor, heard: Tensor, source: Tensor, weight: Tensor,
