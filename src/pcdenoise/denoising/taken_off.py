@@ -26,8 +26,8 @@ _UNSURE, _SURE = 1.1, 1.25
 """Gaussian noise and thin parts read up to a quarter more so: factors count in full from there on, up to a tenth not at all."""
 _MOST_TIMES = 2.8
 """Texture is noise to whoever does not know it, and more of it the wider one looks."""
-_MOST_TURNS, _SETTLED = 3, 1.1
-"""A reading is taken anew by its own light, unless it rose by less than a tenth."""
+_MOST_TURNS, _SETTLED = 3, 1.05
+"""A reading is taken anew by its own light, unless it rose by less than a twentieth."""
 FURTHEST_STDS = 5.0
 """Longest move of one pass along the normal: what is further from the surface is no noise but an outlier or another thing."""
 
