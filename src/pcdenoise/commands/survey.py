@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 N_NEIGHBOURS = 16
 """Nearest points whose disc gives the density."""
 
-_COST = (33e-6, 0.8, 900, 0.06e9)
+_COST = (40e-6, 1.2, 1050, 0.07e9)
 """CPU seconds that one pass of the shipped model takes for a point and a run beside that, bytes of memory likewise: a line
 through `benchmarks/speed/measure.py --sizes 50K 800K`. To be set anew when the pass becomes faster."""
 _COST_IN_TORCH = (90e-6, 5.0, 950, 0.36e9)
