@@ -269,5 +269,4 @@ def _sniffed(head: bytes) -> str:
     """The format that the first bytes show; nothing if none."""
     if las.matches(head):
         return "laz" if las.is_compressed(head) else "las"
-    kinds: dict[str, Any] = {"ply": ply, "pcd": pcd, "e57": e57, "ptx": ptx, "xyz": xyz}
-    return next((name for name, module in kinds.items() if module.matches(head)), "")
+    return next((name for name in ("ply", "pcd", "e57", "ptx", "xyz") if _MODULES[name].matches(head)), "")

@@ -23,7 +23,7 @@ from pcdenoise.io.e57_file import Container, Field, Layout
 from pcdenoise.io.e57_new import NAMES, NAMESPACES, OURS, PROVENANCE, added, created, described, storable
 from pcdenoise.io.e57_stations import AXES_OF_BOUNDS, AZIMUTH, BOUNDS, CARTESIAN, SPHERICAL, Station, offset, stations_of
 from pcdenoise.io.e57_xml import Edits, Element, a_text, parsed
-from pcdenoise.io.source import STATION, Column, changed, free_name, moved_rows
+from pcdenoise.io.source import STATION, Column, changed, free_name, moved_points, station_numbers
 
 _NOTES = "names and notes"
 _SECTIONS = ("Blob", "CompressedVector")
@@ -59,7 +59,7 @@ class E57Source:
     def has_steps(self) -> bool:
         """Whether all world coordinates are whole numbers of steps: no floats, no angles, no poses."""
         return all(
-            station.systems[0] == CARTESIAN and not station.is_placed and field.kind in ("integer", "scaled")
+            station.systems[0] == CARTESIAN and station.pose.is_home and field.kind in ("integer", "scaled")
             for station in self.stations
             for field in station.coordinates
         )
@@ -73,17 +73,17 @@ class E57Source:
         kinds = {element: element.attributes.get("type") for element in self.root.all()}
         blobs = {offset(element, self.origin): None for element, kind in kinds.items() if kind == "Blob"}
         notes = [element.text for element, kind in kinds.items() if kind == "String" and element.name != PROVENANCE]
-        places = [json.dumps([station.rotation.tolist(), station.translation.tolist()]) for station in self.stations]
+        places = [json.dumps([station.pose.back.tolist(), station.pose.shift.tolist()]) for station in self.stations]
         texts = [
             stream
             for records in (station.records for station in self.stations)
             for field, stream in zip(records.fields, records.streams, strict=True)
             if field.kind == "text"
         ]
-        metadata = self.root.find("coordinateMetadata")
+        metadata, is_home = self.root.find("coordinateMetadata"), all(station.pose.is_home for station in self.stations)
         found = {
             "images": b"".join(e57_file.section_at(self.container, blob, self.origin) for blob in blobs),
-            "poses of stations": "\n".join(places).encode() if any(station.is_placed for station in self.stations) else b"",
+            "poses of stations": b"" if is_home else "\n".join(places).encode(),
             "coordinate metadata": b"" if metadata is None else metadata.text.strip().encode(),
             "texts of points": b"".join(texts),
             _NOTES: "\0".join(notes).encode(),
@@ -174,9 +174,7 @@ def read(raw: bytes, origin: str) -> Scan:
         attribute = free_name(NAMES.get(name, name.removeprefix(OURS)), columns)
         labels[attribute], columns[attribute] = name, _column(stations, name)
     if len(stations) > 1:
-        kind = np.min_scalar_type(len(stations) - 1)
-        numbers = np.repeat(np.arange(len(stations), dtype=kind), [station.records.n for station in stations])
-        columns[free_name(STATION, columns)] = numbers
+        columns[free_name(STATION, columns)] = station_numbers([station.records.n for station in stations])
     source = replace(source, labels=labels, columns=columns)
     return Scan(source.points(), columns, "e57", origin, source)
 
@@ -197,8 +195,7 @@ def write(scan: Scan, file: BinaryIO, *, provenance: Mapping[str, Any] | None = 
     source, columns = scan.source, changed(scan)
     if any(name in source.columns and name not in source.labels for name in columns):
         raise ScanError("of which station a point is cannot be changed; write .las or .ply instead")
-    before, edits, parts = source.points(), Edits(source.xml), []
-    moved = np.logical_or.reduce([moved_rows(before[:, i], scan.points[:, i]) for i in range(3)])
+    edits, parts, moved = Edits(source.xml), [], moved_points(source.points(), scan.points)
     new = storable({name: values for name, values in columns.items() if name not in source.labels})
     for station in source.stations:
         part, rows = _Part.of(station), station.rows
@@ -253,23 +250,24 @@ def _as_stored(field: Field, values: Column) -> Column:
 
 def _move(station: Station, part: _Part, edits: Edits, points: Points, moved: Mask) -> None:
     """Puts moved (n, 3) points of a station into all coordinates that it has, and their bounds into its XML."""
+    bounds = {name: element for name in BOUNDS if (element := station.element.find(name)) is not None}
+    systems = {*station.systems, *(BOUNDS[name] for name in bounds)}
+    places = {system: station.from_world(points[moved], system) for system in systems}
+    for name, element in bounds.items():
+        _stretch(element, places[BOUNDS[name]], AXES_OF_BOUNDS[name], edits)
     for system in station.systems:
-        new = station.from_world(points[moved], system)
-        for axis, name in enumerate(system):
-            number, values, before = station.records.index_of(name), station.records.values(name), station.records.measured(name)
+        for name, new in zip(system, places[system].T, strict=True):
+            number, values = station.records.index_of(name), station.records.values(name)
             assert number is not None
             assert values is not None
-            assert before is not None
             if name == AZIMUTH:  # from 0 to 2 π, or from -π on: as the file counts
-                new[:, axis] += 2 * np.pi * np.rint((before[moved] - new[:, axis]) / (2 * np.pi))
-            stored = _as_stored(part.fields[number], new[:, axis])
+                before = station.records.measured(name)
+                assert before is not None
+                new = new + 2 * np.pi * np.rint((before[moved] - new) / (2 * np.pi))
+            stored = _as_stored(part.fields[number], new)
             values = values.astype(stored.dtype)
             values[moved] = stored
             part.put(number, values)
-    for bounds, system in BOUNDS.items():
-        element = station.element.find(bounds)
-        if element is not None:
-            _stretch(element, station.from_world(points[moved], system), AXES_OF_BOUNDS[bounds], edits)
 
 
 def _stretch(bounds: Element, points: Points, axes: Sequence[str], edits: Edits) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import uuid
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any
@@ -87,6 +86,8 @@ def created(scan: Scan, provenance: Mapping[str, Any] | None) -> bytes:
         a_number(axis + "Minimum", float(values.min())) + a_number(axis + "Maximum", float(values.max())) for axis, values in ends
     )
     made_by = "" if provenance is None else a_text(PROVENANCE, json.dumps(provenance))
+    import uuid
+
     digest = hashlib.sha256(layout.data).hexdigest()
     file_id, station_id = (
         f"{{{uuid.uuid5(uuid.NAMESPACE_URL, f'{OUR_NAMESPACE}/{part}/{digest}')}}}" for part in ("file", "station")

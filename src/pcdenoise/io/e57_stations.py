@@ -9,13 +9,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pcdenoise.cloud.scan import Points
 from pcdenoise.errors import ScanError
 from pcdenoise.io import e57_file
 from pcdenoise.io.e57_file import Container, Field, Vector
 from pcdenoise.io.e57_xml import Element
+from pcdenoise.io.pose import Pose
 from pcdenoise.io.source import Column
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
@@ -72,11 +72,6 @@ class Records:
         return prototype(self.element)
 
     @property
-    def size(self) -> int:
-        """Bytes of all streams."""
-        return sum(piece.stop - piece.start for some in self.vector.pieces for piece in some)
-
-    @property
     def streams(self) -> list[bytes]:
         """The stream of each field, without what stands behind its last value."""
         whole = [self.vector.stream(self.container, number) for number in range(len(self.fields))]
@@ -105,24 +100,18 @@ class Records:
 
 @dataclass(frozen=True)
 class Station:
-    """One setup of a scanner: its records, rows of them in the scan, and its pose: world = rotation · local + translation."""
+    """One setup of a scanner: its records, rows of them in the scan, and its pose."""
 
     element: Element
     records: Records
     rows: slice
-    rotation: NDArray[np.float64]
-    translation: NDArray[np.float64]
+    pose: Pose
 
     @property
     def systems(self) -> list[tuple[str, ...]]:
         """The coordinates that it has, Cartesian ones first."""
         names = {field.name for field in self.records.fields}
         return [system for system in (CARTESIAN, SPHERICAL) if names.issuperset(system)]
-
-    @property
-    def is_placed(self) -> bool:
-        """Whether world and local coordinates differ."""
-        return bool((self.rotation != np.eye(3)).any() or self.translation.any())
 
     @property
     def coordinates(self) -> list[Field]:
@@ -141,9 +130,7 @@ class Station:
 
     def world(self) -> Points:
         """(n, 3) points in the world; NaN where a record says that it is no measurement."""
-        points = self.local()
-        if self.is_placed:
-            points = points @ self.rotation.T + self.translation
+        points = self.pose.to_world(self.local())
         state = self.records.values(INVALID[self.systems[0]])
         if state is not None:
             points[state != 0] = np.nan
@@ -151,7 +138,7 @@ class Station:
 
     def from_world(self, points: Points, system: tuple[str, ...]) -> Points:
         """(m, 3) points of the world in the coordinates of one of the station's systems."""
-        local = (points - self.translation) @ self.rotation if self.is_placed else points
+        local = self.pose.from_world(points)
         if system == CARTESIAN:
             return local
         flat = np.hypot(local[:, 0], local[:, 1])
@@ -182,7 +169,7 @@ def stations_of(container: Container, root: Element, origin: str) -> Iterator[St
         if claimed > len(container.data):
             raise ScanError(f"{origin}: several stations claim the same points; it is damaged, fetch it again")
         try:
-            station = Station(element, records, slice(at, at + records.n), *_pose(element.find("pose")))
+            station = Station(element, records, slice(at, at + records.n), _pose(element.find("pose")))
             for bounds in filter(None, map(element.find, BOUNDS)):
                 _ = [end.number() for end in bounds.children]
         except ValueError:
@@ -234,10 +221,10 @@ def _field(element: Element) -> Field:
     return Field(element.name, "scaled" if kind == "scaled" else "integer", low, high, scale, start)
 
 
-def _pose(element: Element | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotation (3, 3) and translation (3,). Raises ValueError for what is no number."""
+def _pose(element: Element | None) -> Pose:
+    """Rotation by a quaternion, and translation. Raises ValueError for what is no number."""
     if element is None:
-        return np.eye(3), np.zeros(3)
+        return Pose(np.eye(3), np.eye(3), np.zeros(3))
     translation = np.array([element.number("translation", axis) for axis in "xyz"])
     w, *v = (element.number("rotation", axis, default=float(axis == "w")) for axis in "wxyz")
     length = float(np.hypot(w, np.hypot(v[0], np.hypot(v[1], v[2]))))
@@ -245,4 +232,5 @@ def _pose(element: Element | None) -> tuple[NDArray[np.float64], NDArray[np.floa
         raise ValueError("no rotation")
     w, (x, y, z) = w / length, np.array(v) / length
     across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + 2 * w * across + 2 * across @ across, translation
+    rotation = np.eye(3) + 2 * w * across + 2 * across @ across
+    return Pose(rotation.T, rotation, translation)

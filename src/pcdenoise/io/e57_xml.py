@@ -8,8 +8,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from html import escape
 from xml.parsers import expat
-from xml.sax.saxutils import escape
 
 from pcdenoise.errors import ScanError
 
@@ -100,7 +100,7 @@ class Edits:
         """Gives attributes, there already or not, other values."""
         tag = self._tag(element)
         for name, value in attributes.items():
-            said = f"{name}={_quoted(value)}".encode()
+            said = f'{name}="{escape(value)}"'.encode()
             tag, n = re.subn(rb"(?<=\s)" + name.encode() + rb"\s*=\s*(?:\"[^\"]*\"|'[^']*')", lambda _: said, tag, count=1)  # noqa: B023
             tag = tag if n else tag.rstrip() + b" " + said
         self._changes[element.start, element.start + len(self._tag(element))] = tag
@@ -147,8 +147,4 @@ def a_number(name: str, value: float, kind: str = "Float") -> str:
 
 def a_text(name: str, text: str) -> str:
     """An element that holds text."""
-    return f'<{name} type="String">{escape(text)}</{name}>'
-
-
-def _quoted(value: str) -> str:
-    return '"' + escape(value, {'"': "&quot;"}) + '"'
+    return f'<{name} type="String">{escape(text, quote=False)}</{name}>'

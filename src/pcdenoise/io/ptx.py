@@ -17,48 +17,29 @@ from numpy.typing import NDArray
 from pcdenoise.cloud.scan import Mask, Points, Scan
 from pcdenoise.errors import ScanError
 from pcdenoise.io.lines import find_lines
-from pcdenoise.io.source import (
-    STATION,
-    Column,
-    changed,
-    colours_as_bytes,
-    exactly,
-    moved_rows,
-    portable,
-    step_decimals,
-)
-from pcdenoise.io.text import NewFields, TextRows, coordinates, plain
+from pcdenoise.io.pose import Pose
+from pcdenoise.io.source import STATION, Column, changed, colours_as_bytes, exactly, moved_points, portable, station_numbers
+from pcdenoise.io.text import NewFields, TextRows, coordinates, new_rows, plain
 
 _HEAD_LINES, _WORDS = 10, (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
 """Lines before the points of a station and how many numbers each has: columns, rows, the scanner's place and axes, its pose."""
 _NAMES = ("intensity", "red", "green", "blue")
-_NEW_FILE_STEP = 1e-9
 
 
 @dataclass(frozen=True)
 class _Station:
-    """One grid: its ten lines, the rows, its (N, 3) local points, and world = local · turn + shift."""
+    """One grid: its ten lines, the rows, its (N, 3) local points and its pose."""
 
     head: bytes
     points_in_file: TextRows
     local: Points
-    turn: NDArray[np.float64]
-    shift: NDArray[np.float64]
-
-    @property
-    def is_placed(self) -> bool:
-        """Whether world and local coordinates differ."""
-        return bool((self.turn != np.eye(3)).any() or self.shift.any())
+    pose: Pose
 
     def world(self) -> Points:
         """(n, 3) points in the world; NaN where the scanner saw nothing."""
-        points = self.local @ self.turn + self.shift if self.is_placed else self.local.copy()
+        points = self.pose.to_world(self.local)
         points[~self.local.any(axis=1)] = np.nan
         return points
-
-    def from_world(self, points: Points) -> Points:
-        """(n, 3) points of the world in its own frame."""
-        return (points - self.shift) @ np.linalg.inv(self.turn) if self.is_placed else points
 
 
 @dataclass(frozen=True)
@@ -84,7 +65,7 @@ class PtxSource:
         poses = b"\n".join(b"\n".join(head[2:]) for head in lines)
         grids = b"\n".join(b" x ".join(head[:2]) for head in lines)
         is_grid = any(1 not in (int(head[0]), int(head[1])) for head in lines)
-        placed = any(station.is_placed for station in self.stations)
+        placed = not all(station.pose.is_home for station in self.stations)
         return {**({"poses of stations": poses} if placed else {}), **({"grids of stations": grids} if is_grid else {})}
 
     def without(self, names: Collection[str]) -> PtxSource:
@@ -123,8 +104,8 @@ def read(raw: bytes, origin: str) -> Scan:
     starts, ends = find_lines(octets)
     stations: list[_Station] = []
     parts: list[list[Column | None]] = []
-    at = 0
-    while at < len(starts) and (not stations or raw[starts[at] :].strip()):
+    at, stop = 0, len(raw.rstrip())
+    while at < len(starts) and (not stations or starts[at] < stop):
         station, columns, at = _station(raw, octets, starts, ends, at, origin)
         stations.append(station)
         parts.append(columns)
@@ -137,8 +118,7 @@ def read(raw: bytes, origin: str) -> Scan:
             small = exactly(values, "u1") if name != "intensity" else None
             read_columns[name] = values if small is None else small
     if len(stations) > 1:
-        numbers = np.arange(len(stations), dtype=np.min_scalar_type(len(stations) - 1))
-        read_columns[STATION] = np.repeat(numbers, [len(station.local) for station in stations])
+        read_columns[STATION] = station_numbers([len(station.local) for station in stations])
     after = raw[starts[at] :] if at < len(starts) else b""
     source = PtxSource(stations, after, read_columns, origin)
     return Scan(source.points(), read_columns, "ptx", origin, source)
@@ -158,12 +138,11 @@ def write(scan: Scan, file: BinaryIO) -> None:
     source, columns = scan.source, changed(scan)
     if STATION in columns:
         raise ScanError("of which station a point is cannot be changed; write .las or .ply instead")
-    before = source.points()
-    moved = np.logical_or.reduce([moved_rows(before[:, i], scan.points[:, i]) for i in range(3)])
+    moved = moved_points(source.points(), scan.points)
     for station, rows in zip(source.stations, _slices(source.stations), strict=True):
         lines, fields = station.points_in_file, list[NewFields]()
         if moved[rows].any():
-            local = np.where(moved[rows, None], station.from_world(scan.points[rows]), station.local)
+            local = np.where(moved[rows, None], station.pose.from_world(scan.points[rows]), station.local)
             fields += [coordinates(lines, i, station.local, local[:, i], moved[rows]) for i in range(3)]
         there = _NAMES[: len(lines.first_fields()) - 3]
         fields += [plain(columns[name][rows], 3 + i) for i, name in enumerate(there) if name in columns]
@@ -182,11 +161,12 @@ def _station(
     if [len(numbers) for numbers in head] != list(_WORDS):
         raise ScanError(f"{origin}: line {at + 1} does not begin the ten lines of a station; it is cut off or damaged")
     (columns,), (rows,) = head[:2]
-    pose = np.array(head[6:])
+    matrix = np.array(head[6:])
+    turn, shift = matrix[:3, :3], matrix[3, :3]
     count = columns * rows
     if not (columns >= 0 <= rows and columns == int(columns) and rows == int(rows)):
         raise ScanError(f"{origin}: line {at + 1}: {columns:g} x {rows:g} points are no grid; it is damaged")
-    if not abs(np.linalg.det(pose[:3, :3])) > 0:
+    if not abs(np.linalg.det(turn)) > 0:
         raise ScanError(f"{origin}: line {at + 7}: the station's pose flattens all points; it is damaged")
     first, last = at + _HEAD_LINES, at + _HEAD_LINES + int(count)
     if last > len(starts):
@@ -199,7 +179,7 @@ def _station(
     if n_fields not in (4, 7):
         raise ScanError(f"{origin}: line {first + 1} has {n_fields} numbers; a point of a PTX has 4, or 7 with its colour")
     values = points.numbers(range(n_fields))
-    station = _Station(raw[starts[at] : begin], points, np.stack(values[:3], axis=1), pose[:3, :3], pose[3, :3])
+    station = _Station(raw[starts[at] : begin], points, np.stack(values[:3], axis=1), Pose(turn, np.linalg.inv(turn), shift))
     return station, [*values[3:], *[None] * (7 - n_fields)], last
 
 
@@ -232,11 +212,7 @@ def _create(scan: Scan, file: BinaryIO) -> None:
     columns = _storable(colours_as_bytes(portable(scan.attributes)))
     n = len(scan)
     file.write(f"{n}\n1\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n".encode())
-    starts = np.arange(n, dtype=np.int64) * 2
-    rows = TextRows(np.frombuffer(b"0\n" * n, np.uint8), starts, starts + 1, None, "<new>", 1)
-    form = f"%.{min(step_decimals(scan.points, _NEW_FILE_STEP), 15)}f"
-    points = np.where(scan.finite[:, None], scan.points, 0.0)
-    fields = [NewFields(points[:, i], form, 0 if i == 0 else None) for i in range(3)]
+    rows, fields = new_rows(np.where(scan.finite[:, None], scan.points, 0.0), None)
     intensity = columns.pop("intensity", np.full(n, 0.5))
     for piece in rows.rewritten([*fields, plain(intensity), *(plain(columns[name]) for name in _NAMES[1:] if name in columns)]):
         file.write(piece)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -60,6 +60,17 @@ def moved_rows(before: Column, after: Column) -> Mask:
     """(N,) where a coordinate changed; NaN that stayed NaN did not."""
     moved: Mask = (before != after) & ~(np.isnan(before) & np.isnan(after))
     return moved
+
+
+def moved_points(before: Points, after: Points) -> Mask:
+    """(N,) rows of which a coordinate changed."""
+    moved: Mask = np.logical_or.reduce([moved_rows(before[:, i], after[:, i]) for i in range(3)])
+    return moved
+
+
+def station_numbers(sizes: Sequence[int]) -> Column:
+    """(N,) the number of the station that each point is of, from how many points each has."""
+    return np.repeat(np.arange(len(sizes), dtype=np.min_scalar_type(len(sizes) - 1)), sizes)
 
 
 def free_name(name: str, taken: Iterable[str]) -> str:

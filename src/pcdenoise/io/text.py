@@ -1,7 +1,7 @@
 """Rows of text fields inside a file's bytes: read, replace and append columns. Not here: which column means what.
 
-The bytes are never turned into a list of lines: a row is a pair of offsets, a change is a splice. XYZ, ASCII PLY and ASCII PCD
-share this.
+The bytes are never turned into a list of lines: a row is a pair of offsets, a change is a splice. XYZ, PTX, ASCII PLY and
+ASCII PCD share this.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ _BLOCK_ROWS = 1 << 16
 _LONGEST_NUMBER = 64
 _LONGEST_TEXT = 256
 COORDINATE_STEP = 1e-6
+_NEW_FILE_STEP = 1e-9
 _EXCHANGED = np.frombuffer(bytes(range(256)).translate(bytes.maketrans(b",.", b".,")), np.uint8)
 _PLAIN = np.array([byte in (9, LF, CR) or (BLANK <= byte < 127 and byte != QUOTE) for byte in range(256)])
 
@@ -307,6 +308,14 @@ def fewest_decimals(values: Column) -> int | None:
         ):
             return decimals
     return None
+
+
+def new_rows(points: Points, delimiter: int | None) -> tuple[TextRows, list[NewFields]]:
+    """Rows of a file that is not there yet, a field each, and what makes it x of (N, 3) points and puts y and z behind it."""
+    starts = np.arange(len(points), dtype=np.int64) * 2
+    rows = TextRows(np.frombuffer(b"0\n" * len(points), np.uint8), starts, starts + 1, delimiter, "<new>", 1)
+    form = f"%.{min(step_decimals(points, _NEW_FILE_STEP), 15)}f"
+    return rows, [NewFields(points[:, i], form, 0 if i == 0 else None) for i in range(3)]
 
 
 def plain(values: Column, column: ColumnIndex | None = None) -> NewFields:

@@ -12,16 +12,15 @@ from pcdenoise.cloud.scan import Mask, Points, Scan
 from pcdenoise.errors import ScanError
 from pcdenoise.io.files import Raw, check_not_cut, let_go
 from pcdenoise.io.lines import Octets, find_lines, first_visible, is_number
-from pcdenoise.io.source import Column, changed, colours_as_bytes, exactly, moved_rows, portable, step_decimals
+from pcdenoise.io.source import Column, changed, colours_as_bytes, exactly, moved_rows, portable
 from pcdenoise.io.source import is_number as holds_numbers
-from pcdenoise.io.text import NewFields, TextRows, commas_for_points, coordinate_form, coordinates, plain
+from pcdenoise.io.text import NewFields, TextRows, commas_for_points, coordinate_form, coordinates, new_rows, plain
 from pcdenoise.io.xyz_header import AXES, Layout, axis_of, decoded, unique
 
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 _COUNTS = frozenset(["id", "fid", "oid", "nr", "no", "n°", "num", "number", "nummer", "pkt", "pkt-nr", "punkt", "point", "punto"])
 """What first columns are called that number the points."""
 _FEWEST_COUNTED, _MOST_COUNTED = 20, 4096
-_NEW_FILE_STEP = 1e-9
 _MOST_COLUMNS = 4096
 _STREAM_HEAD = 4 << 20
 
@@ -250,9 +249,9 @@ def write(scan: Scan, file: BinaryIO, *, suffix: str = ".xyz") -> None:
         head, body = _own(scan, scan.source, None)
     else:
         columns = {name: values for name, values in colours_as_bytes(portable(scan.attributes)).items() if holds_numbers(values)}
-        head, rows = _created(len(scan), suffix, list(columns))
-        form = f"%.{min(step_decimals(scan.points, _NEW_FILE_STEP), 15)}f"
-        fields = [NewFields(scan.points[:, i], form, 0 if i == 0 else None) for i in range(3)]
+        delimiter = ord(",") if suffix == ".csv" else None
+        head = _title(len(scan), suffix, list(columns))
+        rows, fields = new_rows(scan.points, delimiter)
         body = rows.rewritten([*fields, *(plain(values) for values in columns.values())])
     file.write(head)
     for piece in body:
@@ -311,11 +310,9 @@ def _whole(rows: TextRows, column: int, values: Column) -> Column:
     return values if whole is None else whole
 
 
-def _created(n_rows: int, suffix: str, names: Sequence[str]) -> tuple[bytes, TextRows]:
-    """Head and rows of a new file: each row is one field, to be replaced by x; the others get appended."""
+def _title(n_rows: int, suffix: str, names: Sequence[str]) -> bytes:
+    """What stands before the rows of a new file."""
     delimiter = "," if suffix == ".csv" else " "
     title = delimiter.join(["x", "y", "z", *(name.replace(delimiter, "_") for name in names)])
     head = f"{title}\n" if suffix == ".csv" else f"{n_rows}\n" if suffix == ".pts" else f"# {title}\n" if names else ""
-    starts = np.arange(n_rows, dtype=np.int64) * 2
-    body = np.frombuffer(b"0\n" * n_rows, np.uint8)
-    return head.encode(), TextRows(body, starts, starts + 1, None if delimiter == " " else ord(delimiter), "<new>", 1)
+    return head.encode()

@@ -223,8 +223,5 @@ def _initial(config: TrainConfig, init: str | None) -> store.Network:
         return network
     if config.network == "mcconv":
         return MCConvNetwork(MCConvConfig(config.width, config.sampled, unit=config.unit))
-    return ProjectionNetwork(
-        ProjectionConfig(
-            config.channels, config.neighbours, config.rounds, config.landing_rounds, config.messages or config.channels
-        )
-    )
+    sizes = (config.channels, config.neighbours, config.rounds, config.landing_rounds)
+    return ProjectionNetwork(ProjectionConfig(*sizes, messages=config.messages or 0))

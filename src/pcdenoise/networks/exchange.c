@@ -10,8 +10,6 @@
 #include "../cloud/geometry.h"
 #include "channels.h"
 
-#define MOST_NEIGHBOURS 64
-
 typedef struct {
     const float *features, *own, *heard;     /* (F, M, K), (M, C), (N, C) */
     const int32_t *source;                   /* (M, K) rows of the sources */
@@ -44,12 +42,6 @@ INLINE void hear_edges(const Exchange *given, int64_t i, int j, int other, Chann
     }
 }
 
-INLINE float largest_weight(const Exchange *given, int64_t i) {
-    float most = 1e-12f;
-    for (int j = 0; j < given->k; j++) most = larger(most, given->weight[i * given->k + j]);
-    return most;
-}
-
 /* The messages (K, C) of a point and, for their derivative, what the first layer gives (K, C) cut at zero. */
 INLINE void say(const Exchange *given, int64_t i, float *hidden, float *messages, const int width) {
     const Channels own = plus(load(given->own + i * width, width), load(given->first_bias, width), width);
@@ -58,30 +50,9 @@ INLINE void say(const Exchange *given, int64_t i, float *hidden, float *messages
         Channels one, two;
         hear_edges(given, i, j, other, own, &one, &two, width);
         store(hidden + j * width, not_negative(one, width), width), store(hidden + other * width, not_negative(two, width), width);
-        one = two = load(given->second_bias, width);
-        for (int c = 0; c < width; c++) {
-            const Channels weight = load(given->second + c * width, width);
-            one = plus_scaled(one, hidden[j * width + c], weight, width);
-            two = plus_scaled(two, hidden[other * width + c], weight, width);
-        }
-        store(messages + j * width, not_negative(one, width), width);
-        store(messages + other * width, not_negative(two, width), width);
-    }
-}
-
-/* The mean and the most of a point's messages. */
-INLINE void pool(const Exchange *given, int64_t i, const float *messages, Channels *mean, Channels *most, const int width) {
-    const float most_weight = largest_weight(given, i);
-    *mean = none(width), *most = none(width);
-    for (int j = 0; j < given->k; j++) {
-        const Channels message = load(messages + j * width, width);
-        const float weight = given->weight[i * given->k + j], share = weight / most_weight;
-        for (int v = 0; v < width / LANES; v++) {
-            const Lanes shared = share * message.part[v];
-            const Mask more = shared > most->part[v];
-            mean->part[v] += weight * message.part[v];
-            most->part[v] = (Lanes)(((Mask)shared & more) | ((Mask)most->part[v] & ~more));
-        }
+        const float *const firsts[2] = {hidden + j * width, hidden + other * width};
+        float *const message[2] = {messages + j * width, messages + other * width};
+        second_layer(firsts, given->second, given->second_bias, message, width);
     }
 }
 
@@ -91,7 +62,7 @@ INLINE void forward_of_width(const Exchange *given, int64_t start, int64_t stop,
     for (int64_t i = start; i < stop; i++) {
         Channels mean, most;
         say(given, i, hidden, messages, width);
-        pool(given, i, messages, &mean, &most, width);
+        pool(messages, given->weight + i * k, k, &mean, &most, width);
         store(given->mean + i * width, mean, width);
         store(given->most + i * width, most, width);
         for (int h = 0; given->head && h < 3; h++) {
@@ -131,10 +102,10 @@ INLINE void backward_of_width(const Exchange *given, int64_t start, int64_t stop
     for (int64_t i = start; i < stop; i++) {
         Channels mean, most; /* made anew as well: an equal value is looked for, which another rounding would hide */
         say(given, i, hidden, messages, width);
-        pool(given, i, messages, &mean, &most, width);
+        pool(messages, given->weight + i * k, k, &mean, &most, width);
         const Channels of_mean = of->mean ? load(of->mean + i * width, width) : none(width);
         const Channels of_most = of->most ? load(of->most + i * width, width) : none(width);
-        const float most_weight = largest_weight(given, i);
+        const float most_weight = largest(given->weight + i * k, k);
         Channels of_bias = load(of->second_bias, width), of_own = none(width);
         for (int j = 0; j < k; j++) {
             const Channels message = load(messages + j * width, width);

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pcdenoise.cloud.blocks import each_block
+from pcdenoise.networks.fused import MESSAGES, MOST_NEIGHBOURS
 
 try:
     from pcdenoise.networks import _exchange
@@ -23,8 +24,7 @@ except ImportError:
 else:
     IS_BUILT = True
 
-_WIDTHS, _N_FEATURES, _MOST_NEIGHBOURS = (32, 48), 8, 64
-"""What the compiled code is made for."""
+_N_FEATURES = 8  # of an edge, in the compiled code
 _ROWS = 256  # 24 edges of 32 channels each: 0.8 MB a tensor
 
 
@@ -60,7 +60,7 @@ def exchange(
 
 def _is_compiled(features: Tensor, own: Tensor) -> bool:
     _, k, f = features.shape
-    fits = own.shape[1] in _WIDTHS and f == _N_FEATURES and k <= _MOST_NEIGHBOURS
+    fits = own.shape[1] in MESSAGES and f == _N_FEATURES and k <= MOST_NEIGHBOURS
     return IS_BUILT and fits and features.dtype == own.dtype == torch.float32
 
 
@@ -75,14 +75,14 @@ class _Compiled(torch.autograd.Function):
         given = [tensor.contiguous() for tensor in (features.permute(2, 0, 1), own, heard, source.int(), weight, *layers)]
         made = [own.new_empty(m, c), own.new_empty(m, c), own.new_empty(len(head), m, k)]
         _spread(lambda rows, _part: _exchange.forward(_given(given, made), rows.start, rows.stop), m)
-        ctx.save_for_backward(*given, *made)
+        ctx.save_for_backward(*given)
         ctx.set_materialize_grads(False)
         return made[0], made[1], made[2]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *of_made: Tensor | None) -> tuple[Tensor | None, ...]:
-        given, made = ctx.saved_tensors[:-3], ctx.saved_tensors[-3:]
+        given, made = ctx.saved_tensors, (None, None, None)  # which are made anew
         features, own, heard, head, head_bias = given[0], given[1], given[2], given[10], given[11]
         (f, m, _), (n, c), n_parts = features.shape, heard.shape, torch.get_num_threads()
         of_features = torch.empty_like(features) if ctx.needs_input_grad[1] else None

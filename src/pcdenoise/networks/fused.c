@@ -10,7 +10,6 @@
 #include "channels.h"
 
 #define POINT_FEATURES 4
-#define MOST_NEIGHBOURS 64
 #define KERNEL_SHARE 0.7f
 
 typedef struct {
@@ -153,8 +152,7 @@ INLINE void edges(Edges *edge, const Neighbourhood *near, const float *own, cons
     }
 }
 
-/* The messages of two edges, each a layer over its features, what both ends say added, and a second layer. Two at a time share
-   every load of a weight and keep eight or twelve sums going, as many as the processor's multipliers take to be busy. */
+/* The messages of two edges, each a layer over its features, what both ends say added, and a second layer. */
 INLINE void say(const Round *round, const float *const feature[2], Channels own, const float *const heard[2], float *const message[2],
                 const int width) {
     Channels one = plus(own, load(heard[0], width), width), other = plus(own, load(heard[1], width), width);
@@ -164,21 +162,15 @@ INLINE void say(const Round *round, const float *const feature[2], Channels own,
         one = plus_scaled(one, feature[0][i], weight, width), other = plus_scaled(other, feature[1][i], weight, width);
     }
     store(hidden[0], not_negative(one, width), width), store(hidden[1], not_negative(other, width), width);
-    one = other = load(round->message_bias, width);
-    for (int i = 0; i < width; i++) {
-        const Channels weight = load(round->message + i * width, width);
-        one = plus_scaled(one, hidden[0][i], weight, width), other = plus_scaled(other, hidden[1][i], weight, width);
-    }
-    store(message[0], not_negative(one, width), width), store(message[1], not_negative(other, width), width);
+    const float *const firsts[2] = {hidden[0], hidden[1]};
+    second_layer(firsts, round->message, round->message_bias, message, width);
 }
 
 /* One exchange: (K, width) messages, and the point's features replaced by what it makes of them. */
 INLINE void exchange(const Round *round, const Neighbourhood *near, const Edges *edge, const int32_t *index,
                      const float *heard, float *features, float *messages, const int width) {
     const Channels own = layer(load(round->edge_bias, width), features, CHANNELS, round->own, width);
-    Channels mean = none(width), most = none(width);
-    float most_weight = 1e-12f;
-    for (int j = 0; j < near->k; j++) most_weight = larger(most_weight, near->weight[j]);
+    Channels mean, most;
     for (int j = 0; j < near->k; j += 2) {
         const int other = j + 1 < near->k ? j + 1 : j; /* the last of an odd number is made twice */
         const float *const feature[2] = {edge->feature[j], edge->feature[other]};
@@ -186,16 +178,7 @@ INLINE void exchange(const Round *round, const Neighbourhood *near, const Edges 
         float *const message[2] = {messages + j * width, messages + other * width};
         say(round, feature, own, said, message, width);
     }
-    for (int j = 0; j < near->k; j++) {
-        const Channels message = load(messages + j * width, width);
-        const float weight = near->weight[j], share = weight / most_weight;
-        for (int v = 0; v < width / LANES; v++) {
-            const Lanes shared = share * message.part[v];
-            const Mask more = shared > most.part[v];
-            mean.part[v] += weight * message.part[v];
-            most.part[v] = (Lanes)(((Mask)shared & more) | ((Mask)most.part[v] & ~more));
-        }
-    }
+    pool(messages, near->weight, near->k, &mean, &most, width);
     float pooled[2 * MOST_CHANNELS], news[CHANNELS], average = 0, variance = 0;
     store(pooled, mean, width);
     store(pooled + width, most, width);
