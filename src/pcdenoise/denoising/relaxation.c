@@ -23,6 +23,12 @@ INLINE void flatten(double *vector, const double *normal) {
     for (int axis = 0; axis < 3; axis++) vector[axis] -= height * normal[axis];
 }
 
+/* From 0 to 1: how well two unit normals of either sign agree. */
+INLINE double agreement(const double *one, const double *other) {
+    const double cosine = dot(one, other), squared = cosine * cosine;
+    return (squared * squared) * (squared * squared);
+}
+
 /* Unit normals of the points in rows [start, stop), and from 0, no surface, to 1, a sheet. */
 static ANY_PROCESSOR void tangents(const double *points, Graph graph, int64_t start, int64_t stop, const double *planarity,
                                    double *normals, double *sheet) {
@@ -56,8 +62,8 @@ typedef struct {
 } Directions;
 
 /* Points one step further: to the centre of their cell in the tangent plane, held by where they began. */
-static ANY_PROCESSOR void even(const double *points, const double *began, const double *normals, const double *sheet,
-                               const double *spacing, const double *held, Graph graph, Directions directions, int64_t start,
+static ANY_PROCESSOR void even(const double *points, const double *began, const double *normals, const double *spacing,
+                               const double *held, const double *pace, Graph graph, Directions directions, int64_t start,
                                int64_t stop, double *evened) {
     for (int64_t i = start; i < stop; i++) {
         const int32_t *row = graph.index + i * graph.k;
@@ -71,11 +77,11 @@ static ANY_PROCESSOR void even(const double *points, const double *began, const 
         for (int j = 1; j < graph.k; j++) {
             double offset[3];
             away(offset, own, points + 3 * (size_t)row[j]);
-            const double cosine = dot(upright, normals + 3 * (size_t)row[j]);
-            const double nearness = 2 * cosine * cosine / larger64(dot(offset, offset), 1e-300);
-            const double u = nearness * dot(offset, first), v = nearness * dot(offset, second);
+            const double u = dot(offset, first), v = dot(offset, second), height = dot(offset, upright);
+            const double squared = u * u + v * v + agreement(upright, normals + 3 * (size_t)row[j]) * height * height;
+            const double nearness = 2 / larger64(squared, 1e-300);
             for (int d = 0; d < directions.n; d++)
-                bound[d] = larger64(bound[d], u * directions.waves[d] + v * directions.waves[directions.n + d]);
+                bound[d] = larger64(bound[d], nearness * (u * directions.waves[d] + v * directions.waves[directions.n + d]));
         }
         for (int d = 0; d < directions.n; d++) {
             const double furthest = directions.open[1] * spacing[i], reach = bound[d] * furthest > 1 ? 1 / bound[d] : furthest;
@@ -86,10 +92,10 @@ static ANY_PROCESSOR void even(const double *points, const double *began, const 
         }
         away(back, own, began + 3 * i);
         flatten(back, upright);
-        const double share = sheet[i] / (1 + held[i]), pull = 2. / 3 / larger64(area, 1e-300);
+        const double pull = 2. / 3 / larger64(area, 1e-300);
         for (int axis = 0; axis < 3; axis++) {
             const double to_centre = pull * (centre[0] * first[axis] + centre[1] * second[axis]);
-            evened[3 * i + axis] = own[axis] + share * (to_centre + held[i] * back[axis]);
+            evened[3 * i + axis] = own[axis] + pace[i] * (to_centre + held[i] * back[axis]);
         }
     }
 }
@@ -111,7 +117,8 @@ static ANY_PROCESSOR void land(const double *points, const double *began, const 
             const double *normal = normals + 3 * (size_t)row[j];
             double offset[3];
             away(offset, own, began + 3 * (size_t)row[j]);
-            const double falling = 1 - dot(offset, offset) / furthest, weight = falling * falling + 1e-12;
+            const double falling = 1 - dot(offset, offset) / furthest;
+            const double weight = falling * falling * agreement(normals + 3 * i, normal) + 1e-12;
             const double depth = dot(offset, normal);
             total += weight;
             for (int a = 0; a < 3; a++) {
@@ -153,16 +160,16 @@ static PyObject *call_tangents(PyObject *self, PyObject *args) {
 static PyObject *call_even(PyObject *self, PyObject *args) {
     Graph graph;
     Directions directions;
-    unsigned long long points, began, normals, sheet, spacing, held, waves, evened;
+    unsigned long long points, began, normals, spacing, held, pace, waves, evened;
     long long start, stop;
     (void)self;
-    if (!PyArg_ParseTuple(args, "O&LLKKKKKKKidddK", graph_of, &graph, &start, &stop, &points, &began, &normals, &sheet, &spacing,
-                          &held, &waves, &directions.n, directions.open, directions.open + 1, &directions.wall, &evened))
+    if (!PyArg_ParseTuple(args, "O&LLKKKKKKKidddK", graph_of, &graph, &start, &stop, &points, &began, &normals, &spacing, &held,
+                          &pace, &waves, &directions.n, directions.open, directions.open + 1, &directions.wall, &evened))
         return NULL;
     if (directions.n > MOST_DIRECTIONS) return PyErr_Format(PyExc_ValueError, "at most %d directions", MOST_DIRECTIONS);
     directions.waves = AT(double, waves);
     Py_BEGIN_ALLOW_THREADS
-    even(AT(double, points), AT(double, began), AT(double, normals), AT(double, sheet), AT(double, spacing), AT(double, held), graph,
+    even(AT(double, points), AT(double, began), AT(double, normals), AT(double, spacing), AT(double, held), AT(double, pace), graph,
          directions, start, stop, AT(double, evened));
     Py_END_ALLOW_THREADS
     Py_RETURN_NONE;
