@@ -43,6 +43,13 @@ def tidy(target: Path) -> None:
     _removed_if_abandoned(target.with_name(f".{_stem(target)}.part"), 0)
 
 
+def put(path: Path, data: bytes) -> None:
+    """Writes a file that is there whole or not at all, and the folder it is in. Raises OSError if it cannot be written."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replaced(path) as file:
+        file.write(data)
+
+
 def _part_of(target: Path) -> Path:
     """The hidden file to write to: one name, which a killed run's leftover makes room for, or a random one while it is in use."""
     part = target.with_name(f".{_stem(target)}.part")

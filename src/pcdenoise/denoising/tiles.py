@@ -1,7 +1,7 @@
 """Clouds larger than memory: cells on disk, each cleaned with what lies around it, so that a tile gives what the whole gives.
 
-Here: what is done with each cell, and what is kept for a later `resume`. Not here: where space is cut (cuts.py), cells and their
-surroundings (cells.py), scan files (io), one pass (denoiser.py).
+Here: what is done with each cell, and what is kept for a later `resume`. Not here: how the cells come about (plan.py), what
+lies around them (cells.py), scan files (io), one pass (denoiser.py).
 
 All that is global in a pass is found first, streaming, exactly as it is found in memory: the frame's origin, the probes and the
 noise level they read, the stop rule. The rest is local, and every draw is a hash of a point's place in the file, so a cell needs
@@ -23,7 +23,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -33,30 +33,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdenoise.cloud import drift
-from pcdenoise.cloud.neighbours import (
-    Distances,
-    Identity,
-    coordinate_hash,
-    distinct_by,
-    drawn_by,
-)
-from pcdenoise.cloud.noise_level import N_PROBES, NoiseLevel, by_place, estimate_from
-from pcdenoise.cloud.scan import Mask, Points, check_extent
+from pcdenoise.cloud.neighbours import Distances, drawn_by
+from pcdenoise.cloud.noise_level import NoiseLevel, by_place, estimate_from
+from pcdenoise.cloud.scan import Mask, Points
 from pcdenoise.config import DenoiseConfig
 from pcdenoise.denoising import classical, denoiser, outliers, risk, taken_off, uncertainty
 from pcdenoise.denoising.cells import Cells, Part, n_own
-from pcdenoise.denoising.cuts import by_cell, cell_of, cuts_of, number_of_cells
+from pcdenoise.denoising.cuts import by_cell, cell_of
 from pcdenoise.denoising.denoiser import Progress
-from pcdenoise.denoising.local_cloud import N_CENTRAL, origin_of
+from pcdenoise.denoising.plan import Chunks, Plan, plan_in
 from pcdenoise.denoising.seeds import share_of_seeds
 from pcdenoise.networks.store import Model
-from pcdenoise.whole_files import replaced
+from pcdenoise.whole_files import put
 
 BASE_BYTES, POINT_BYTES = 400 << 20, 1100
 """Memory of the program itself, and of each point of the part that is being cleaned: measured where torch
 runs the network, with a tenth to spare; compiled code takes three quarters of it."""
 _RIM_NEIGHBOURS = 24
-_LARGER_CELLS = 1.5  # than asked for are still gone on with: how much memory is free changes from run to run
 _GATHERED = (192, 2048)  # neighbours kept of each probe: most clouds show their surface within the first
 _N_LENGTHS = 1_000_000
 
@@ -90,21 +83,6 @@ class Rows:
     std: NDArray[np.float64] | None = None
 
 
-class _Smallest:
-    """The n points of smallest key of a stream, each key once."""
-
-    def __init__(self, n: int) -> None:
-        self.n, self.keys, self.points = n, np.empty(0, np.uint64), np.empty((0, 3))
-
-    def add(self, keys: Identity, points: Points) -> None:
-        if len(self.keys) == self.n:
-            few = keys < self.keys[-1]
-            keys, points = keys[few], points[few]
-        keys, points = np.concatenate([self.keys, keys]), np.concatenate([self.points, points])
-        keys, rows = np.unique(keys, return_index=True)
-        self.keys, self.points = keys[: self.n], points[rows[: self.n]]
-
-
 class Tiles:
     """One cloud on its way through the cells. `chunks` streams its (n, 3) rows in file order, the same every time it is called.
 
@@ -114,7 +92,7 @@ class Tiles:
     def __init__(
         self,
         folder: Path,
-        chunks: Callable[[], Iterable[Points]],
+        chunks: Chunks,
         model: Model | None,
         config: DenoiseConfig,
         cell_points: int,
@@ -130,71 +108,15 @@ class Tiles:
         self._gathered: dict[int, dict[bytes, tuple[Distances, Points]]] = {}
 
     @cached_property
-    def plan(self) -> dict[str, Any]:
-        """Counts, origin, cuts and probes; cells are made on the disk if they are not there."""
-        path = self.folder / "plan.json"
-        if path.is_file() and (old := self._followable(path.read_bytes())):
-            return old
-        shutil.rmtree(self.folder, ignore_errors=True)
-        (self.folder / "start").mkdir(parents=True)
-        central, probed = _Smallest(N_CENTRAL), _Smallest(N_PROBES)
-        low, high = np.full(3, np.inf), np.full(3, -np.inf)
-        n_rows = n_finite = 0
-        for chunk in self.chunks():
-            usable = chunk[np.isfinite(chunk).all(axis=1)]
-            identity = coordinate_hash(usable, 0)
-            central.add(identity, usable)
-            probed.add(drawn_by(identity, self.config.seed), usable)
-            n_rows, n_finite = n_rows + len(chunk), n_finite + len(usable)
-            low, high = np.minimum(low, usable.min(axis=0, initial=np.inf)), np.maximum(high, usable.max(axis=0, initial=-np.inf))
-        if n_finite:
-            check_extent(np.stack([low, high]))
-        origin = origin_of(central.points)
-        cuts = cuts_of(central.points - origin, max(1, -(-n_finite // self.cell_points)))
-        plan: dict[str, Any] = {
-            "job": self.job,
-            "cell_points": self.cell_points,
-            "n_rows": n_rows,
-            "n_finite": n_finite,
-            "origin": origin.tolist(),
-            "cuts": cuts,
-        }
-        plan |= {
-            "n_cells": number_of_cells(cuts),
-            "probes": (probed.points - origin).tolist(),
-            "probe_keys": probed.keys.tolist(),
-        }
-        low, high = (low - origin, high - origin) if n_finite else (np.zeros(3), np.zeros(3))
-        plan |= {"diagonal": float(np.linalg.norm(high - low)), "low": low.tolist(), "extent": float((high - low).max())}
-        for chunk in self.chunks():
-            usable = chunk[np.isfinite(chunk).all(axis=1)]
-            rows = np.empty((len(usable), 4))
-            rows[:, :3], rows[:, 3] = usable - origin, coordinate_hash(usable, 0).view(np.float64)
-            for cell, those in by_cell(cell_of(rows[:, :3], cuts)):
-                with (self.folder / "start" / f"{cell}.f64").open("ab") as file:
-                    file.write(rows[those].tobytes())
-        plan["n_distinct"] = sum(self._sort(cell) for cell in range(plan["n_cells"]))
-        _write(path, json.dumps(plan).encode())
-        return plan
-
-    def _followable(self, said: bytes) -> dict[str, Any] | None:
-        """The plan that a file holds, if it is one of this job and of cells that fit in memory now."""
-        try:
-            plan: dict[str, Any] = json.loads(said)
-            same = (
-                "extent" in plan
-                and plan["job"] == json.loads(json.dumps(self.job))
-                and plan["cell_points"] <= _LARGER_CELLS * self.cell_points
-            )
-        except (ValueError, KeyError, TypeError):
-            return None
-        return plan if same else None
+    def plan(self) -> Plan:
+        """Counts, frame, cuts and probes; cells are made on the disk if they are not there."""
+        return plan_in(self.folder, self.chunks, self.job, self.cell_points, self.config.seed)
 
     @cached_property
     def cells(self) -> Cells:
         """The distinct points, cell by cell."""
-        plan, low = self.plan, np.array(self.plan["low"])
-        return Cells(self.folder, plan["n_cells"], plan["n_distinct"], plan["cell_points"], low, plan["extent"], self.threads)
+        plan, low = self.plan, np.array(self.plan.low)
+        return Cells(self.folder, plan.n_cells, plan.n_distinct, plan.cell_points, low, plan.extent, self.threads)
 
     def run(self, on_progress: Progress = lambda _task, _share: None) -> None:
         """All passes over all cells, and the figures of a `denoiser.Result`."""
@@ -204,7 +126,7 @@ class Tiles:
             for cell in self.cells:
                 self.find_outliers(cell, first.as_read)
                 on_progress("outliers", (cell + 1) / len(self.cells))
-        most = denoiser.most_passes(self.plan["n_distinct"], first, self.config)
+        most = denoiser.most_passes(self.plan.n_distinct, first, self.config)
         judge = self._judge(first) if most and self.config.iters == "auto" else None
         for number in range(1, most + 1):
             task = "cleaning" if self.config.iters == 1 else f"pass {number}"
@@ -224,7 +146,7 @@ class Tiles:
             for cell in self.cells:
                 self.find_uncertainty(cell, n_done, first.as_read)
         drifts = [self._drift(cell, n_done) for cell in self.cells]
-        share = np.array([n for n, _, _ in drifts]) / max(1, self.plan["n_distinct"])
+        share = np.array([n for n, _, _ in drifts]) / max(1, self.plan.n_distinct)
         self.figures = {
             "noise": first.std,
             "spacing": first.spacing,
@@ -232,8 +154,8 @@ class Tiles:
             "iterations": n_done,
             "drift": float(np.sqrt((share * [size**2 for _, size, _ in drifts]).sum())),
             "drift_inward": float((share * [inward for _, _, inward in drifts]).sum()),
-            "points_not_finite": self.plan["n_rows"] - self.plan["n_finite"],
-            "points_coincident": self.plan["n_finite"] - self.plan["n_distinct"],
+            "points_not_finite": self.plan.n_rows - self.plan.n_finite,
+            "points_coincident": self.plan.n_finite - self.plan.n_distinct,
             "cells": len(self.cells),
         }
 
@@ -243,11 +165,11 @@ class Tiles:
 
     def rows(self) -> Iterator[Rows]:
         """Every chunk's rows at their new places, in file order; completes the figures. Needs `run` before."""
-        origin, n_done = np.array(self.plan["origin"]), self.figures["iterations"]
+        origin, n_done = np.array(self.plan.origin), self.figures["iterations"]
         read = np.zeros(len(self.cells), dtype=np.int64)
         lengths: list[NDArray[np.float64]] = []
         width = 4 + self.config.uncertainty
-        step = -(-self.plan["n_rows"] // _N_LENGTHS) or 1
+        step = -(-self.plan.n_rows // _N_LENGTHS) or 1
         n_unmoved = n_outliers = 0
         longest = 0.0
         for cell in self.cells:
@@ -256,7 +178,7 @@ class Tiles:
             finite = np.flatnonzero(np.isfinite(chunk).all(axis=1))
             std = np.full(len(chunk), np.nan) if self.config.uncertainty else None
             result = Rows(chunk.copy(), np.zeros(len(chunk), bool), np.ones(len(chunk), bool), std)
-            for cell, those in by_cell(cell_of(chunk[finite] - origin, self.plan["cuts"])):
+            for cell, those in by_cell(cell_of(chunk[finite] - origin, self.plan.cuts)):
                 path = self.folder / "done" / f"{cell}.f64"
                 done = np.fromfile(path, count=width * len(those), offset=8 * width * read[cell]).reshape(-1, width)
                 read[cell] += len(those)
@@ -270,7 +192,7 @@ class Tiles:
             longest = max(longest, float(length.max(initial=0.0)))
             n_unmoved, n_outliers = n_unmoved + int(result.unmoved.sum()), n_outliers + int(result.outlier.sum())
             yield result
-        some = np.concatenate(lengths) if self.plan["n_finite"] else np.zeros(1)
+        some = np.concatenate(lengths) if self.plan.n_finite else np.zeros(1)
         self.figures |= {
             "move_median": float(np.median(some)),
             "move_p99": float(np.quantile(some, 0.99)),
@@ -285,8 +207,8 @@ class Tiles:
         plan = self.plan
         if path.is_file():
             return NoiseLevel(**json.loads(path.read_text()))
-        probed, keys = np.array(plan["probes"]).reshape(-1, 3), np.array(plan["probe_keys"], np.uint64)
-        for cell, those in by_cell(cell_of(probed, plan["cuts"])):
+        probed, keys = np.array(plan.probes).reshape(-1, 3), np.array(plan.probe_keys, np.uint64)
+        for cell, those in by_cell(cell_of(probed, plan.cuts)):
             part = self.cells.part(cell, number)
             drawn = drawn_by(part.identity, self.config.seed)
             order = np.argsort(drawn)
@@ -297,8 +219,8 @@ class Tiles:
             kept = self._gathered[next(n for n in _GATHERED if n >= k)]
             missing = np.array([centre.tobytes() not in kept for centre in centres])
             if missing.any():
-                most = min(next(n for n in _GATHERED if n >= k), plan["n_distinct"])
-                for _, those in by_cell(cell_of(centres[missing], plan["cuts"])):  # near each other, so that few cells are read
+                most = min(next(n for n in _GATHERED if n >= k), plan.n_distinct)
+                for _, those in by_cell(cell_of(centres[missing], plan.cuts)):  # near each other, so that few cells are read
                     asked = centres[missing][those]
                     near, distances, rows = self.cells.nearest(asked, most, number)
                     kept.update(
@@ -307,19 +229,19 @@ class Tiles:
             pairs = [kept[centre.tobytes()] for centre in centres]
             return np.stack([distances[:k] for distances, _ in pairs]), np.stack([near[:k] for _, near in pairs])
 
-        found = estimate_from(probed, plan["n_distinct"], around, None if number else self.config.noise)
+        found = estimate_from(probed, plan.n_distinct, around, None if number else self.config.noise)
         self._gathered = {}
         if number == 0:
             model = self.model if self.config.method == "network" else None
             found = taken_off.level_by(found, probed, self._sample, model, self.config.seed, self.threads)
-        _write(path, json.dumps(asdict(found)).encode())
+        put(path, json.dumps(asdict(found)).encode())
         return found
 
     def _judge(self, level: NoiseLevel) -> denoiser.Judge:
         """The points that stand for the whole cloud: those nearest to the first of all probes, as in memory."""
-        points, identity = self._sample(np.array(self.plan["probes"][0]), risk.MOST_POINTS)
+        points, identity = self._sample(np.array(self.plan.probes[0]), risk.MOST_POINTS)
         some = risk.Risk(points, identity, level.as_read, self.config.seed, self.threads)
-        return denoiser.Judge(some, level, self.plan["diagonal"], self.model, self.config, self.threads)
+        return denoiser.Judge(some, level, self.plan.diagonal, self.model, self.config, self.threads)
 
     def _sample(self, centre: Points, most: int) -> taken_off.Sample:
         around = self.cells.around(centre, most)
@@ -332,7 +254,7 @@ class Tiles:
             start = self.cells.part(cell, 0).points
             moved = start if number == 0 else denoiser.limited(start, self.cells.part(cell, number).points, self.config)
             found = drift.measure(start, moved, self.config.seed, self.threads)
-            _write(path, json.dumps([len(start), found.size, found.inward]).encode())
+            put(path, json.dumps([len(start), found.size, found.inward]).encode())
         n, size, inward = json.loads(path.read_text())
         return n, size, inward
 
@@ -344,11 +266,11 @@ class Tiles:
         own, tile = self._tile(cell, number - 1)
         order = self.cells.order(tile.points)
         moved = denoiser.one_pass(
-            tile.points[order], tile.identity[order], level, self.plan["diagonal"], self.model, self.config, self.threads
+            tile.points[order], tile.identity[order], level, self.plan.diagonal, self.model, self.config, self.threads
         )
         back = np.empty_like(tile.points)
         back[order] = moved
-        _write(path, back[: len(own.points)].tobytes())
+        put(path, back[: len(own.points)].tobytes())
 
     def find_outliers(self, cell: int, level: NoiseLevel) -> None:
         """Marks the outliers of one cell; nothing if that is done already."""
@@ -358,7 +280,7 @@ class Tiles:
             order = self.cells.order(tile.points)
             found = np.zeros(len(order), bool)
             found[order] = outliers.find(tile.points[order], level=level, threads=self.threads)
-            _write(path, found[: len(own.points)].tobytes())
+            put(path, found[: len(own.points)].tobytes())
 
     def find_uncertainty(self, cell: int, number: int, level: NoiseLevel) -> None:
         """How far the points of one cell may still be off after that pass; nothing if that is done already."""
@@ -374,7 +296,7 @@ class Tiles:
             start, cleaned = measured.points, tile.points[self.cells.order(tile.points)]
             final = start if number == 0 else denoiser.limited(start, own.points, self.config)
             std = uncertainty.estimate(cleaned, start, own.points, final, noise[: len(start)], self.threads)
-        _write(path, std.tobytes())
+        put(path, std.tobytes())
 
     def _tile(self, cell: int, number: int) -> tuple[Part, Part]:
         """A cell's own points after a pass, and these followed by what lies around, as of `Cells.tile`."""
@@ -395,16 +317,7 @@ class Tiles:
         """Radius of what a pass looks at, where that is a length: in the bilateral filter."""
         if self.config.method != "bilateral":
             return 0.0
-        return classical.ball_radius(level) if self.config.radius is None else self.config.radius * self.plan["diagonal"]
-
-    def _sort(self, cell: int) -> int:
-        """Leaves one row for each place of a cell, in the order of the hashes; how many there are."""
-        path = self.folder / "start" / f"{cell}.f64"
-        rows = np.fromfile(path).reshape(-1, 4) if path.is_file() else np.empty((0, 4))
-        first, place = distinct_by(np.ascontiguousarray(rows[:, 3]).view(np.uint64))
-        _write(path, rows[first].tobytes())
-        _write(path.with_suffix(".i8"), place.astype(np.int64).tobytes())
-        return len(first)
+        return classical.ball_radius(level) if self.config.radius is None else self.config.radius * self.plan.diagonal
 
     def _finish(self, cell: int, number: int) -> None:
         """Writes the new places of a cell's rows, in file order; nothing if that is done already."""
@@ -419,15 +332,8 @@ class Tiles:
             done[:, 3] += np.fromfile(self.folder / "outliers" / f"{cell}.u1", bool)
         if self.config.uncertainty:
             done[:, 4] = np.fromfile(self.folder / "std" / f"{cell}.f64")
-        _write(path, done[np.fromfile(self.folder / "start" / f"{cell}.i8", np.int64)].tobytes())
+        put(path, done[np.fromfile(self.folder / "start" / f"{cell}.i8", np.int64)].tobytes())
 
     def remove(self) -> None:
         """Removes the work folder."""
         shutil.rmtree(self.folder, ignore_errors=True)
-
-
-def _write(path: Path, data: bytes) -> None:
-    """A file that is there whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replaced(path) as file:
-        file.write(data)
