@@ -166,9 +166,11 @@ def test_iterate_ends_where_denoise_ends(data: Path) -> None:
 
 def test_models_lists_the_default_model_and_prints_its_card(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["models"]) == 0
-    assert "default" in capsys.readouterr().out
+    listed = capsys.readouterr().out
     assert main(["models", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)[0]["n_parameters"] > 1000
+    first = json.loads(capsys.readouterr().out)[0]
+    assert first["name"] == "default" and first["n_parameters"] > 1000
+    assert f"{first['scores']['10000_0.02']['cd']:.2f} / " in next(line for line in listed.splitlines() if "default" in line)
     assert main(["models", "default"]) == 0
     assert len(capsys.readouterr().out) > 500
     assert main(["models", "default", "--json"]) == 0

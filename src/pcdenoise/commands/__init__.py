@@ -39,7 +39,7 @@ _SUMMARIES = {
     " (report.html).",
     "verify": "Prove that every row and attribute survived, byte for byte, and say how far points moved. Exit code 5 if not.",
     "undo": "Take a cleaned scan back to the original, exactly; needs a scan written by denoise --displacement.",
-    "models": "List the models that ship, or print one's card: training data, noise, scores, licence.",
+    "models": "List the models that ship, with their scores, or print one's card: training data, noise, all scores, licence.",
     "synth": "Make a data set: of each surface a clean cloud with colours, evenly spaced, a noisy one per level, and its mesh.",
     "split": "Cut scans to compact parts of a bounded size; rows keep their order and everything they carry.",
     "train": "Train a model. Ctrl-C keeps what was learned so far.",
