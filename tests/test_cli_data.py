@@ -169,7 +169,8 @@ def test_models_lists_the_default_model_and_prints_its_card(capsys: pytest.Captu
     listed = capsys.readouterr().out
     assert main(["models", "--json"]) == 0
     first = json.loads(capsys.readouterr().out)[0]
-    assert first["name"] == "default" and first["n_parameters"] > 1000
+    assert first["name"] == "default"
+    assert first["n_parameters"] > 1000
     assert f"{first['scores']['10000_0.02']['cd']:.2f} / " in next(line for line in listed.splitlines() if "default" in line)
     assert main(["models", "default"]) == 0
     assert len(capsys.readouterr().out) > 500
