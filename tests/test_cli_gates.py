@@ -72,6 +72,14 @@ def test_verify_compares_the_content_of_vlrs_and_evlrs(
     assert name in capsys.readouterr().err
 
 
+def test_verify_says_what_to_do_where_rows_were_removed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before, after = tmp_path / "before.xyz", tmp_path / "after.xyz"
+    before.write_text("0 0 0\n1 0 0\n0 1 0\n")
+    after.write_text("0 0 0\n0 1 0\n")
+    assert main(["verify", str(before), str(after)]) == 5
+    assert "3 rows became 2, so none can be compared; clean with --outliers flag" in capsys.readouterr().err
+
+
 def test_verify_allows_a_text_no_more_than_its_decimals_round(tmp_path: Path, rng: np.random.Generator) -> None:
     points = np.round(rng.uniform(0, 1000, (200, 3)), 6)
     before, after = tmp_path / "before.xyz", tmp_path / "after.xyz"

@@ -40,6 +40,7 @@ def verify(
     """Prove that every row and attribute survived, byte for byte, and say how far points moved. Exit code 5 if not.
 
     Compared are all columns, and what is beside them: VLRs and EVLRs of LAS with their content, faces of PLY, a viewpoint.
+    Where rows were removed (denoise --outliers remove) nothing can be compared; --outliers flag keeps them.
     Drift is how far the surface moved as a whole: removing noise moves points to both sides and leaves it near 0.
 
     Example: pcdenoise verify scan.laz clean.laz --max-move 0.05 --max-drift 0.3
@@ -78,7 +79,8 @@ def compare(before: Scan, after: Scan, noise: float | None = None) -> dict[str, 
     from pcdenoise.commands.survey import as_cleaned
 
     if len(before) != len(after):
-        lost = [f"{len(before)} rows became {len(after)}"]
+        fix = "so none can be compared; clean with --outliers flag rather than remove, or verify the file that it came from"
+        lost = [f"{len(before)} rows became {len(after)}, {fix}"]
         return {
             "rows": [len(before), len(after)], "attributes": {}, "beside": {}, "added": [], "move": {},
             "drift": None, "drift_inward": None, "noise_before": None, "lost": lost,
