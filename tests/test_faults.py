@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import io as streams
+import json
 import os
 import signal
 import subprocess
@@ -22,7 +23,7 @@ from pcdenoise.commands import main
 from pcdenoise.commands.files import Job
 from pcdenoise.commands.processes import in_processes
 from pcdenoise.commands.workers import Figures
-from pcdenoise.denoising import tiles
+from pcdenoise.denoising import plan, tiles
 from pcdenoise.errors import PcdenoiseError, of_the_system
 from pcdenoise.io import files
 from pcdenoise.networks import store
@@ -488,6 +489,29 @@ def test_a_signal_while_cells_are_cleaned_leaves_them_for_resume(
     assert main(["denoise", str(path), "-o", str(out), *IN_CELLS, "--resume"]) == 0
     assert {one: one.stat().st_mtime_ns for one in kept} == kept, "cleaned again"
     assert out.read_bytes() == expected
+
+
+def test_a_plan_of_cells_goes_on_where_it_is_sound_and_loses_nothing_where_it_cannot_be_read(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points, kept = rng.random((500, 3)), tmp_path / "pass_1" / "0.f64"
+
+    def again() -> plan.Plan:
+        kept.parent.mkdir(exist_ok=True)
+        kept.touch()
+        return plan.plan_in(tmp_path, lambda: [points], {"name": ("a", 1)}, 100, seed=1)
+
+    first = plan.plan_in(tmp_path, lambda: [points], {"name": ("a", 1)}, 100, seed=1)
+    assert again() == first
+    assert kept.exists()
+    said = json.loads((tmp_path / "plan.json").read_text())
+    (tmp_path / "plan.json").write_text(json.dumps({**said, "cell_points": "x"}))
+    assert again() == first
+    assert not kept.exists(), "of a damaged plan"
+    monkeypatch.setattr(Path, "read_bytes", lambda _path: (_ for _ in ()).throw(OSError(5, "Input/output error")))
+    with pytest.raises(OSError, match="Input/output error"):
+        again()
+    assert kept.exists()
 
 
 @pytest.mark.parametrize("damage", [b"", b"{", b"[]", b"{}", b"\xff", b'{"job": {}, "cell_points": "x"}'])

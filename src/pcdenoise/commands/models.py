@@ -39,7 +39,7 @@ def models(
             [model.name, f"{model.n_parameters:,}", model.config.network, *_scores(model), model.config.summary]
             for model in store.available()
         ]
-        print(table(["model", "parameters", "network", *_LISTED.values(), "what"], rows, left={0, 2, 5}))
+        print(table(["model", "parameters", "network", *_LISTED.values(), "what"], rows, left={0, 2, 3 + len(_LISTED)}))
 
 
 def _scores(model: ModelInfo) -> list[str]:

@@ -79,8 +79,9 @@ def compare(before: Scan, after: Scan, noise: float | None = None) -> dict[str, 
     from pcdenoise.commands.survey import as_cleaned
 
     if len(before) != len(after):
-        fix = "so none can be compared; clean with --outliers flag rather than remove, or verify the file that it came from"
-        lost = [f"{len(before)} rows became {len(after)}, {fix}"]
+        flag = "clean with --outliers flag rather than remove, or " if len(after) < len(before) else ""
+        fix = f"{flag}verify the file that it came from"
+        lost = [f"{len(before)} rows became {len(after)}, so none can be compared; {fix}"]
         return {
             "rows": [len(before), len(after)], "attributes": {}, "beside": {}, "added": [], "move": {},
             "drift": None, "drift_inward": None, "noise_before": None, "lost": lost,

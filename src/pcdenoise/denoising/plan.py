@@ -56,22 +56,27 @@ class Plan:
 def plan_in(folder: Path, chunks: Chunks, job: Mapping[str, Any], cell_points: int, seed: int) -> Plan:
     """The plan of a job: the one in the folder if it is of this job, else a new one in an emptied folder, with its cells.
 
-    Raises ScanError for clouds that are too wide.
+    Raises ScanError for clouds that are too wide, OSError if a plan that is there cannot be read: nothing is removed then.
     """
-    return _kept(folder, job, cell_points) or _made(folder, chunks, job, cell_points, seed)
+    plain: dict[str, Any] = json.loads(json.dumps(job))
+    return _kept(folder, plain, cell_points) or _made(folder, chunks, plain, cell_points, seed)
 
 
-def _kept(folder: Path, job: Mapping[str, Any], cell_points: int) -> Plan | None:
-    """The plan in a folder, if it is one of this job and of cells that fit in memory now."""
-    try:
-        plan = Plan(**json.loads((folder / _PLAN).read_bytes()))
-    except (OSError, ValueError, TypeError):
+def _kept(folder: Path, job: dict[str, Any], cell_points: int) -> Plan | None:
+    """The plan in a folder, if it is one of this job and of cells that fit in memory now; OSError if one cannot be read."""
+    path = folder / _PLAN
+    if not path.is_file():
         return None
-    is_same = plan.job == json.loads(json.dumps(job)) and plan.cell_points <= _LARGER_CELLS * cell_points
+    said = path.read_bytes()
+    try:
+        plan = Plan(**json.loads(said))
+        is_same = plan.job == job and plan.cell_points <= _LARGER_CELLS * cell_points
+    except (ValueError, TypeError):
+        return None
     return plan if is_same else None
 
 
-def _made(folder: Path, chunks: Chunks, job: Mapping[str, Any], cell_points: int, seed: int) -> Plan:
+def _made(folder: Path, chunks: Chunks, job: dict[str, Any], cell_points: int, seed: int) -> Plan:
     shutil.rmtree(folder, ignore_errors=True)
     start = folder / "start"
     start.mkdir(parents=True)
@@ -98,7 +103,7 @@ def _made(folder: Path, chunks: Chunks, job: Mapping[str, Any], cell_points: int
                 file.write(rows[those].tobytes())
     n_cells = number_of_cells(cuts)
     plan = Plan(
-        job=dict(job),
+        job=job,
         cell_points=cell_points,
         n_rows=n_rows,
         n_finite=n_finite,

@@ -137,15 +137,15 @@ class _Sheet:
         self.sheet[rows] = np.clip((planarity - _SHEET[0]) / (_SHEET[1] - _SHEET[0]), 0, 1)
 
     def _even(self, current: Points, rows: slice, after: Points) -> None:
-        upright = self.normal[rows]
-        offset = current[self.index[rows, 1:]] - current[rows, None]
+        others, upright = self.index[rows, 1:], self.normal[rows]
+        offset = current[others] - current[rows, None]
         first = _flattened(self.points[self.index[rows, 1]] - self.points[rows], upright)
         first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-300)
         second = np.cross(upright, first)
-        along = np.stack([np.einsum("mkc,mc->mk", offset, axis) for axis in (first, second)])
-        squared = (along**2).sum(axis=0) + self._agreement(rows)[:, 1:] * np.einsum("mkc,mc->mk", offset, upright) ** 2
-        along *= 2 / np.maximum(squared, 1e-300)
-        shares = sum(side[:, :, None] * wave for side, wave in zip(along, _WAVES, strict=True))
+        *along, height = (np.einsum("mkc,mc->mk", offset, axis) for axis in (first, second, upright))
+        squared = along[0] ** 2 + along[1] ** 2 + _agreement(self.normal[others], upright) * height**2
+        nearness = 2 / np.maximum(squared, 1e-300)
+        shares = sum((nearness * side)[:, :, None] * wave for side, wave in zip(along, _WAVES, strict=True))
         ends, spacing = np.maximum(shares.max(axis=1), 1e-300), self.spacing[rows, None]
         radius = np.minimum(1 / ends, _OPEN[1] * spacing)
         is_open = np.maximum((radius / spacing - _OPEN[0]) / (_OPEN[1] - _OPEN[0]), 0)
@@ -160,17 +160,19 @@ class _Sheet:
     def _land(self, current: Points, rows: slice, after: Points) -> None:
         offset, theirs = self.points[self.index[rows]] - current[rows, None], self.normal[self.index[rows]]
         squared = (offset**2).sum(axis=2)
-        weight = (1 - squared / np.maximum(squared.max(axis=1, keepdims=True), 1e-300)) ** 2 * self._agreement(rows) + 1e-12
+        falling = 1 - squared / np.maximum(squared.max(axis=1, keepdims=True), 1e-300)
+        weight = falling**2 * _agreement(theirs, self.normal[rows]) + 1e-12
         weight /= weight.sum(axis=1, keepdims=True)
         upright = np.linalg.eigh(np.einsum("mk,mki,mkj->mij", weight, theirs, theirs))[1][:, :, 2]
         over = np.einsum("mk,mkc,mc->m", weight, offset, upright)[:, None] * upright
         under = np.einsum("mk,mk,mkc->mc", weight, (offset * theirs).sum(axis=2), theirs)
         after[rows] = current[rows] + 0.5 * self.sheet[rows, None] * (under + over)
 
-    def _agreement(self, rows: slice) -> NDArray[np.float64]:
-        """(M, 1 + K) from 0 to 1, half at 24 degrees: how well neighbours' normals agree with the own."""
-        agreement: NDArray[np.float64] = np.einsum("mkc,mc->mk", self.normal[self.index[rows]], self.normal[rows]) ** 8
-        return agreement
+
+def _agreement(theirs: NDArray[np.float64], own: Points) -> NDArray[np.float64]:
+    """(M, K) from 0 to 1, half at 24 degrees: how well unit normals (M, K, 3) agree with (M, 3) others, signs apart."""
+    agreement: NDArray[np.float64] = np.einsum("mkc,mc->mk", theirs, own) ** 8
+    return agreement
 
 
 def _flattened(vectors: Points, normal: Points) -> Points:

@@ -84,7 +84,7 @@ class Rows:
 
 
 class Tiles:
-    """One cloud on its way through the cells. `chunks` streams its (n, 3) rows in file order, the same every time it is called.
+    """One cloud on its way through the cells.
 
     fingerprint: facts that tell this job from another one; what is found in the folder of the same job is not done again.
     """

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from pcdenoise.errors import ModelError, in_one_line
-from pcdenoise.whole_files import replaced
+from pcdenoise.whole_files import put
 
 if TYPE_CHECKING:
     from pcdenoise.networks.mcconv import MCConvNetwork
@@ -193,10 +193,8 @@ def save(
         CARD: card.encode(),
     }
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         for name, data in files.items():
-            with replaced(folder / name) as file:
-                file.write(data)
+            put(folder / name, data)
     except OSError as fault:
         raise ModelError(f"{folder}: cannot be saved ({fault.strerror}); check permissions and free space") from None
 
